@@ -1,0 +1,39 @@
+"""Per-pixel status: why a pixel has a value, or none, and what its user can do.
+
+The codes are written to the results store as a CF flag variable (``flag_values``, ``flag_meanings``).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """One byte per pixel; everything but ``OK`` and ``APERTURE`` has NaN maps."""
+
+    OK = 0
+    NO_STRUCTURE = 1
+    APERTURE = 2
+    INCOHERENT = 3
+    NOT_CONVERGED = 4
+    BORDER = 5
+    MASKED = 6
+    NOT_FINITE = 7
+    NOT_COMPUTED = 255
+
+
+ADVICE: dict[Status, str] = {
+    Status.OK: "estimated",
+    Status.NO_STRUCTURE: "the window holds no texture above the noise: enlarge the window, improve light or focus",
+    Status.APERTURE: "texture in one direction only: values along the other direction are uncertain, see the standard errors",
+    Status.INCOHERENT: "the window's content does not move as one surface: shrink the window, or correct the preshift",
+    Status.NOT_CONVERGED: "the solver found no isolated solution: use --precision f64 or a larger window",
+    Status.BORDER: "too little of the window lies inside all images: nothing to do, or a smaller window",
+    Status.MASKED: "outside the given mask",
+    Status.NOT_FINITE: "the images hold NaN or infinite grey values here",
+    Status.NOT_COMPUTED: "not computed yet, or outside the region of interest",
+}
+"""One sentence of advice for each status."""
+
+HAS_VALUE = (Status.OK, Status.APERTURE)
+"""Codes whose maps hold numbers."""
