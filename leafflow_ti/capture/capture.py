@@ -1,0 +1,294 @@
+"""A capture: the images of a camera grid over time, read window by window.
+
+Axes are ``t, sy, sx, y, x``: frame, camera row, camera column, pixel row (down), pixel column (right). Frames and
+cameras are addressed by index from 0; the reference camera is ``(n_rows // 2, n_cols // 2)``, and ``k`` counts cameras
+from it. Lengths are in mm, image positions in pixel with (0, 0) the centre of the first pixel. Grey values are those of
+the files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from leafflow_ti.capture.cache import ImageCache
+from leafflow_ti.capture.channels import Array, Channel
+from leafflow_ti.capture.description import FILE_NAME, Description, read_description
+from leafflow_ti.capture.images import read_window
+from leafflow_ti.capture.layout import Layout, find_layout
+from leafflow_ti.errors import ConfigError, InputError
+
+DEFAULT_CACHE_BYTES = 512 * 2**20
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Calibration of the grid; pairs are ``(x, y)``.
+
+    ``f_px``: focal length [px]. ``principal_px``: principal point [px]. ``baseline_mm``: camera step for one index step
+    [mm], 0 along an axis with one camera. ``disparity_offset_px``: added to the disparity seen in the images to give
+    the total disparity [px/step]; same sign as nu, negative for images that were shifted towards each other.
+    """
+
+    f_px: float
+    principal_px: tuple[float, float]
+    baseline_mm: tuple[float, float] = (0.0, 0.0)
+    disparity_offset_px: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Capture(ABC):
+    """Lazy images ``[t, sy, sx, y, x]`` with their geometry; from files (``open_capture``) or from an array."""
+
+    n_frames: int
+    n_rows: int
+    n_cols: int
+    height: int
+    width: int
+    dtype: np.dtype[Any]
+    """Type of the stored samples."""
+    bits: int
+    """Significant bits of a grey value."""
+    geometry: Geometry | None
+    """None for a single camera without calibration (optical flow in pixels only)."""
+    frame_interval_s: float | None
+    frames: tuple[int, ...]
+    """Numbers of the frames in the file names."""
+    description: Description | None = field(repr=False)
+    path: Path | None
+    """The ``capture.toml``, or None for an array."""
+
+    @property
+    def reference(self) -> tuple[int, int]:
+        """Row and column of the reference camera."""
+        return self.n_rows // 2, self.n_cols // 2
+
+    @property
+    def shape(self) -> tuple[int, int, int, int, int]:
+        """``(n_frames, n_rows, n_cols, height, width)``."""
+        return self.n_frames, self.n_rows, self.n_cols, self.height, self.width
+
+    @abstractmethod
+    def _window(self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int) -> Array:
+        """Non-empty window inside the image, in any type; the caller does not write to it."""
+
+    @abstractmethod
+    def fingerprint(self) -> dict[str, Any]:
+        """What identifies the input in a result's provenance."""
+
+    def read(
+        self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int, dtype: npt.DTypeLike = np.float32
+    ) -> Array:
+        """Window ``[y1-y0, x1-x0]`` of one image; what lies outside the image is 0.
+
+        Raises InputError if the file cannot be decoded, IndexError for a frame or camera that does not exist.
+        """
+        out = np.zeros((y1 - y0, x1 - x0), dtype)
+        self._read_into(out, t, sy, sx, y0, x0)
+        return out
+
+    def block(
+        self,
+        frames: Sequence[int],
+        rows: Sequence[int],
+        cols: Sequence[int],
+        y0: int,
+        y1: int,
+        x0: int,
+        x1: int,
+        shift_px: tuple[int, int] = (0, 0),
+        dtype: npt.DTypeLike = np.float32,
+    ) -> Array:
+        """Preshifted windows ``[t, sy, sx, y1-y0, x1-x0]`` of the given frames, camera rows and columns.
+
+        With ``(nx, ny) = shift_px`` and a camera ``(kx, ky)`` steps from the reference, block pixel ``(x', y')`` is
+        image pixel ``(x' + nx kx, y' + ny ky)``: the integer preshift nu0 of model section 1. Outside the images: 0.
+        """
+        out = np.zeros((len(frames), len(rows), len(cols), y1 - y0, x1 - x0), dtype)
+        row0, col0 = self.reference
+        for i, t in enumerate(frames):
+            for j, sy in enumerate(rows):
+                for k, sx in enumerate(cols):
+                    top, left = y0 + shift_px[1] * (sy - row0), x0 + shift_px[0] * (sx - col0)
+                    self._read_into(out[i, j, k], t, sy, sx, top, left)
+        return out
+
+    def _read_into(self, out: Array, t: int, sy: int, sx: int, top: int, left: int) -> None:
+        """Copy the part of a window that lies inside the image; ``out`` is zero before."""
+        for name, index, count in (("frame", t, self.n_frames), ("row", sy, self.n_rows), ("column", sx, self.n_cols)):
+            if not 0 <= index < count:
+                raise IndexError(f"{name} {index} does not exist: the capture has 0 to {count - 1}")
+        y0, y1 = max(top, 0), min(top + out.shape[0], self.height)
+        x0, x1 = max(left, 0), min(left + out.shape[1], self.width)
+        if y0 < y1 and x0 < x1:
+            out[y0 - top : y1 - top, x0 - left : x1 - left] = self._window(t, sy, sx, y0, y1, x0, x1)
+
+
+@dataclass(frozen=True, eq=False)
+class FileCapture(Capture):
+    """A capture on disk; decoded images are cached where the format allows no windows."""
+
+    layout: Layout = field(repr=False)
+    channel: Channel
+    _cache: ImageCache = field(repr=False)
+
+    def _window(self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int) -> Array:
+        path, page = self.layout.paths[self.layout.file[t, sy, sx]], int(self.layout.page[t, sy, sx])
+        if self.layout.info.windowed:
+            return self._checked(path, read_window(path, page, self.channel, y0, y1, x0, x1))
+        return self._cache.get((path, page), lambda: self._decode(path, page))[y0:y1, x0:x1]
+
+    def _decode(self, path: Path, page: int) -> Array:
+        image = self._checked(path, read_window(path, page, self.channel, 0, self.height, 0, self.width))
+        return np.ascontiguousarray(image)
+
+    def _checked(self, path: Path, values: Array) -> Array:
+        """A stated bit depth must hold: a wrong one would give wrong error bars without a word."""
+        if self.bits < 8 * self.dtype.itemsize and self.dtype.kind in "ui" and values.max() > 2**self.bits - 1:
+            raise InputError(f"{path}: grey value {values.max():g} does not fit bit_depth = {self.bits}: correct it")
+        return values
+
+    def fingerprint(self) -> dict[str, Any]:
+        """Number of files, sha256 over their names (relative to the description) and sizes, and sha256 of the bytes
+        of the first and the last file: the same for a copy elsewhere, cheap for any length of sequence."""
+        assert self.path is not None
+        root = self.path.parent
+        listing = hashlib.sha256()
+        for path in self.layout.paths:
+            name = path.relative_to(root) if path.is_relative_to(root) else path
+            listing.update(f"{name.as_posix()}\0{path.stat().st_size}\n".encode())
+        first, last = self.layout.paths[0], self.layout.paths[-1]
+        return {
+            "files": len(self.layout.paths),
+            "names_and_sizes_sha256": listing.hexdigest(),
+            "first_file_sha256": _sha256(first),
+            "last_file_sha256": _sha256(last),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayCapture(Capture):
+    """A capture in memory."""
+
+    images: Array = field(repr=False)  # [t, sy, sx, y, x]
+
+    def _window(self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int) -> Array:
+        window: Array = self.images[t, sy, sx, y0:y1, x0:x1]
+        return window
+
+    def fingerprint(self) -> dict[str, Any]:
+        """Shape, type, and sha256 of the values in C order."""
+        digest = hashlib.sha256(np.ascontiguousarray(self.images).data)
+        return {"shape": list(self.images.shape), "dtype": str(self.dtype), "sha256": digest.hexdigest()}
+
+
+def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> FileCapture:
+    """Open a ``capture.toml``, or the folder that holds one; reads headers only.
+
+    ``cache_bytes`` bounds the decoded images that are kept. Raises ConfigError for an invalid description, InputError,
+    naming files, for missing, doubled, unreadable or unequal images.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / FILE_NAME
+    description = read_description(path)
+    layout = find_layout(description.images, path.parent)
+    info = layout.info
+    n_frames, n_rows, n_cols = layout.file.shape
+    bits = description.images.bit_depth or info.bits
+    return FileCapture(
+        n_frames=n_frames,
+        n_rows=n_rows,
+        n_cols=n_cols,
+        height=info.height,
+        width=info.width,
+        dtype=info.dtype,
+        bits=bits,
+        geometry=_geometry(path, description, n_rows, n_cols, info.height, info.width),
+        frame_interval_s=description.time.interval_s if description.time else None,
+        frames=layout.values["t"],
+        description=description,
+        path=path,
+        layout=layout,
+        channel=description.images.channel,
+        _cache=ImageCache(cache_bytes),
+    )
+
+
+def capture_from_array(
+    images: npt.ArrayLike,
+    geometry: Geometry | None = None,
+    frame_interval_s: float | None = None,
+    bits: int | None = None,
+) -> ArrayCapture:
+    """A capture from grey images ``[t, sy, sx, y, x]``; the array is not copied.
+
+    ``bits`` defaults to those of its type. Raises InputError for another number of axes, an empty array, a type that is
+    not real, or several cameras without geometry.
+    """
+    array = np.asarray(images)
+    if array.ndim != 5 or array.size == 0:
+        raise InputError(f"images of shape {array.shape}: five axes t, sy, sx, y, x are needed, none empty")
+    if array.dtype.kind not in "buif":
+        raise InputError(f"images of type {array.dtype}: give integers or floats")
+    n_frames, n_rows, n_cols, height, width = array.shape
+    if geometry is None and n_rows * n_cols > 1:
+        raise InputError(f"{n_rows} x {n_cols} cameras need a geometry: pass Geometry(f_px, principal_px, baseline_mm)")
+    return ArrayCapture(
+        n_frames=n_frames,
+        n_rows=n_rows,
+        n_cols=n_cols,
+        height=height,
+        width=width,
+        dtype=array.dtype,
+        bits=bits or (1 if array.dtype.kind == "b" else 8 * array.dtype.itemsize),
+        geometry=geometry,
+        frame_interval_s=frame_interval_s,
+        frames=tuple(range(n_frames)),
+        description=None,
+        path=None,
+        images=array,
+    )
+
+
+def _geometry(
+    path: Path, description: Description, n_rows: int, n_cols: int, height: int, width: int
+) -> Geometry | None:
+    """Geometry of a description for a grid of this size; raises ConfigError for what is missing or does not fit."""
+    camera, grid = description.camera, description.grid
+    if n_rows * n_cols > 1 and (camera is None or grid is None):
+        missing = "[camera] focal_length_px" if camera is None else "[grid] baseline_mm"
+        raise ConfigError(f"{path}: a grid of {n_rows} x {n_cols} cameras (rows x columns) needs {missing}: add it")
+    if camera is None:
+        return None
+    baseline = _per_axis(path, "baseline_mm", grid.baseline_mm, n_rows, n_cols) if grid else (0.0, 0.0)
+    offset = _per_axis(path, "disparity_offset_px", grid.disparity_offset_px, n_rows, n_cols) if grid else (0.0, 0.0)
+    for axis, count, step in (("x", n_cols, baseline[0]), ("y", n_rows, baseline[1])):
+        if count > 1 and step == 0:
+            raise ConfigError(f"{path}: [grid] baseline_mm along {axis} is 0 for {count} cameras: give the camera step")
+    return Geometry(
+        f_px=camera.f_px,
+        principal_px=camera.principal_point_px or ((width - 1) / 2, (height - 1) / 2),
+        baseline_mm=(baseline[0] if n_cols > 1 else 0.0, baseline[1] if n_rows > 1 else 0.0),
+        disparity_offset_px=(offset[0] if n_cols > 1 else 0.0, offset[1] if n_rows > 1 else 0.0),
+    )
+
+
+def _per_axis(path: Path, key: str, values: tuple[float, ...], n_rows: int, n_cols: int) -> tuple[float, float]:
+    if len(values) == 2:
+        return values[0], values[1]
+    if n_rows > 1 and n_cols > 1:
+        raise ConfigError(f"{path}: [grid] {key} = {values[0]} for {n_rows} x {n_cols} cameras: give [x, y]")
+    return (0.0, values[0]) if n_rows > 1 else (values[0], 0.0)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,42 @@
+"""``demo``: the whole way without any input, each step shown as the command that does it."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from leafflow_ti.cli.run import quicklook_folder
+from leafflow_ti.errors import UsageError
+
+SMALL: tuple[list[str], list[str]] = (["--size", "256x160"], ["--window", "41", "--stride", "2"])
+FULL: tuple[list[str], list[str]] = (["--size", "301x301"], [])
+"""Options of ``simulate cube`` and of ``run``; the full one has the window and image size of the dissertation."""
+
+
+def demo(
+    folder: Annotated[Path, typer.Argument(metavar="OUTDIR", help="Folder to create.")] = Path("leafflow-demo"),
+    full: Annotated[bool, typer.Option("--full", help="Images of 301 x 301 px, window of 65 px, every pixel.")] = False,
+) -> None:
+    """Simulate a rotating cube, measure it, compare with the truth, draw pictures.
+
+    Nine cameras see nine frames of a textured cube that turns by 0.4 degrees and moves by 1 mm per frame.
+    """
+    from leafflow_ti.cli.main import invoke
+
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"{folder} exists and is not empty: remove it, or name another folder")
+    scene, settings = FULL if full else SMALL
+    capture, out = folder / "cube", folder / "cube.zarr"
+    for title, arguments in (
+        ("A synthetic capture with its exact truth", ["simulate", "cube", str(capture), *scene]),
+        ("Depth, normals and 3D motion of every pixel", ["run", str(capture), "-o", str(out), *settings]),
+        ("Compared with the truth", ["evaluate", str(out), "--truth", str(capture / "truth.npz")]),
+    ):
+        typer.echo(f"\n# {title}\n$ leafflow-ti {shlex.join(arguments)}")
+        invoke(arguments)
+    typer.echo(
+        f"\n# Look at\n{quicklook_folder(out) / 'overview.png'}\n{out}  (leafflow-ti info {shlex.quote(str(out))})"
+    )

@@ -1,0 +1,218 @@
+"""``info``: what a capture or a results store is, for people or as JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from leafflow_ti.cli.run import format_status
+from leafflow_ti.errors import InputError
+
+if TYPE_CHECKING:
+    from leafflow_ti.capture import FileCapture
+    from leafflow_ti.results import ResultStore
+
+
+def info(
+    path: Annotated[Path, typer.Argument(metavar="CAPTURE|OUT.zarr", help="A capture.toml or its folder, or results.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say what a capture, or a results store, is."""
+    if not path.exists():
+        raise InputError(f"{path}: does not exist; give a capture.toml, a folder that holds one, or an OUT.zarr")
+    if (path / "zarr.json").is_file():
+        from leafflow_ti.results import ResultStore
+
+        facts = store_facts(ResultStore.open(path))
+        lines = _store_lines(facts)
+    else:
+        from leafflow_ti.capture import open_capture
+
+        facts = capture_facts(open_capture(path))
+        lines = _capture_lines(facts)
+    typer.echo(json.dumps(facts, indent=2, ensure_ascii=False) if as_json else "\n".join(lines))
+
+
+def capture_facts(capture: FileCapture) -> dict[str, Any]:
+    """Files, grid, images, calibration and working distance of a capture, as JSON values."""
+    facts: dict[str, Any] = {
+        "path": str(capture.path),
+        "files": len(capture.layout.paths),
+        "frames": capture.n_frames,
+        "grid": {"rows": capture.n_rows, "columns": capture.n_cols},
+        "image": {
+            "width_px": capture.width,
+            "height_px": capture.height,
+            "dtype": str(capture.dtype),
+            "bits": capture.bits,
+        },
+        "frame_interval_s": capture.frame_interval_s,
+        "bytes": capture.dtype.itemsize
+        * capture.n_frames
+        * capture.n_rows
+        * capture.n_cols
+        * capture.height
+        * capture.width,
+        "geometry": None,
+        "working_distance": None,
+    }
+    if capture.geometry is not None:
+        g = capture.geometry
+        facts["geometry"] = {
+            "focal_length_px": g.f_px,
+            "principal_point_px": list(g.principal_px),
+            "baseline_mm": list(g.baseline_mm),
+            "disparity_offset_px": list(g.disparity_offset_px),
+        }
+        if capture.n_rows * capture.n_cols > 1:
+            facts["working_distance"] = _working_distance(capture)
+    return facts
+
+
+def _working_distance(capture: FileCapture) -> dict[str, Any]:
+    """Preshift found in the images, and the depths [mm] that it and one pixel more or less of disparity mean.
+
+    Z = -f b / nu (Schuchert 2010, Eq. (6.13)), along the axis with the larger baseline.
+    """
+    from leafflow_ti.capture import find_preshift
+
+    assert capture.geometry is not None
+    try:
+        preshift = find_preshift(capture)
+    except InputError as error:
+        return {"preshift_px": None, "reason": str(error)}
+    baselines = capture.geometry.baseline_mm
+    axis = 0 if abs(baselines[0]) >= abs(baselines[1]) else 1
+    lever = capture.geometry.f_px * abs(baselines[axis])
+    total = abs(preshift[axis] + capture.geometry.disparity_offset_px[axis])
+    return {
+        "preshift_px": list(preshift),
+        "depth_mm": lever / total if total else None,
+        "depth_one_pixel_nearer_mm": lever / (total + 1),
+        "depth_one_pixel_farther_mm": lever / (total - 1) if total > 1 else None,
+        "mm_per_px": lever / total**2 if total else None,
+    }
+
+
+def _capture_lines(facts: dict[str, Any]) -> list[str]:
+    grid, image, geometry, distance = (facts[key] for key in ("grid", "image", "geometry", "working_distance"))
+    cameras = grid["rows"] * grid["columns"]
+    interval = "interval not stated" if facts["frame_interval_s"] is None else f"every {facts['frame_interval_s']:g} s"
+    lines = [
+        f"capture      {facts['path']}",
+        f"cameras      {cameras} ({grid['rows']} row(s) x {grid['columns']} column(s))",
+        f"frames       {facts['frames']}, {interval}",
+        f"images       {facts['files']} file(s), {image['width_px']} x {image['height_px']} px, "
+        f"{image['bits']} bit in {image['dtype']}, {facts['bytes'] / 2**20:.4g} MiB of pixels",
+    ]
+    if geometry is None:
+        return [*lines, "geometry     not calibrated: optical flow in pixels only"]
+    lines += [
+        f"geometry     focal length {geometry['focal_length_px']:g} px, "
+        f"principal point {_pair(geometry['principal_point_px'])} px",
+        f"grid step    {_pair(geometry['baseline_mm'])} mm (x, y)",
+    ]
+    if any(geometry["disparity_offset_px"]):
+        lines.append(
+            f"offset       {_pair(geometry['disparity_offset_px'])} px of disparity per step, added to what is seen"
+        )
+    if distance is not None and distance["preshift_px"] is None:
+        lines.append(f"distance     unknown: {distance['reason']}")
+    elif distance is not None:
+        lines.append(f"preshift     {_pair(distance['preshift_px'])} px per step, found in the images")
+        farther = distance["depth_one_pixel_farther_mm"]
+        if distance["depth_mm"] is not None:
+            lines.append(
+                f"depth        {distance['depth_mm']:.5g} mm at this preshift; "
+                f"1 px of disparity is {distance['mm_per_px']:.4g} mm"
+            )
+        lines.append(
+            f"depth range  {distance['depth_one_pixel_nearer_mm']:.5g} mm to "
+            f"{'infinity' if farther is None else f'{farther:.5g} mm'} within 1 px of disparity"
+        )
+    return lines
+
+
+def _pair(values: list[float]) -> str:
+    return ", ".join(f"{value:g}" for value in values)
+
+
+def _range(ends: list[int]) -> str:
+    return f"{ends[0]} to {ends[1]}"
+
+
+def store_facts(store: ResultStore) -> dict[str, Any]:
+    """Extent, attributes, statuses of all frames, and unit and range of each map in the middle frame."""
+    import numpy as np
+
+    from leafflow_ti.field import quantity, status_counts
+
+    middle = len(store.frames) // 2
+    maps: dict[str, Any] = {}
+    for name in store.names:
+        values = store.read(name, middle)
+        finite = values[np.isfinite(values)]
+        low, median, high = (float(v) for v in np.percentile(finite, (0, 50, 100))) if finite.size else (None,) * 3
+        maps[name] = {"units": quantity(name)[0], "min": low, "median": median, "max": high}
+    counts: dict[str, int] = {}
+    for t_index in range(len(store.frames)):
+        for name, n in status_counts(store.read("status", t_index)).items():
+            counts[name] = counts.get(name, 0) + n
+    return {
+        "path": str(store.path),
+        "frames": list(store.frames),
+        "rows": store.y.size,
+        "columns": store.x.size,
+        "x_px": [int(store.x[0]), int(store.x[-1])],
+        "y_px": [int(store.y[0]), int(store.y[-1])],
+        "interval_s": store.interval_s,
+        "units_done": len(store.done()),
+        "units": store.n_units,
+        "maps_of_frame": store.frames[middle],
+        "maps": maps,
+        "status": counts,
+        "attributes": store.attrs,
+    }
+
+
+def _store_lines(facts: dict[str, Any]) -> list[str]:
+    first, last = facts["frames"][0], facts["frames"][-1]
+    done, units = facts["units_done"], facts["units"]
+    lines = [
+        f"results      {facts['path']}",
+        f"frames       {len(facts['frames'])} ({_range([first, last])})",
+        f"maps         {facts['rows']} x {facts['columns']} (y, x), "
+        f"pixels x {_range(facts['x_px'])}, y {_range(facts['y_px'])}",
+        f"units        {done} of {units} done" + ("" if done == units else ": go on with run --resume"),
+        "",
+        f"status of the pixels of {'all frames' if len(facts['frames']) > 1 else 'the frame'}",
+        *format_status(facts["status"]),
+        "",
+        f"{'frame ' + str(facts['maps_of_frame']):<22} {'unit':<12} {'min':>12} {'median':>12} {'max':>12}",
+    ]
+    for name, row in facts["maps"].items():
+        numbers = " ".join(
+            f"{'-' if row[key] is None else format(row[key], '.6g'):>12}" for key in ("min", "median", "max")
+        )
+        lines.append(f"{name:<22} {row['units']:<12} {numbers}")
+    for key, value in facts["attributes"].items():
+        lines += ["", key, *_indented(value)]
+    return lines
+
+
+def _indented(value: object) -> list[str]:
+    """An attribute as indented lines: text as it is, tables key by key."""
+    if isinstance(value, dict):
+        return [
+            line
+            for key, inner in value.items()
+            for line in (
+                [f"  {key}", *(f"  {x}" for x in _indented(inner))]
+                if isinstance(inner, dict)
+                else [f"  {key}: {inner}"]
+            )
+        ]
+    return [f"  {line}" for line in str(value).splitlines()]

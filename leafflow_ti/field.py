@@ -1,0 +1,150 @@
+"""A measured field: named maps of one frame with status and pixel coordinates, and the table of their units.
+
+Conventions: maps are ``[y, x]`` with y down and x right; ``y`` and ``x`` hold the pixel positions of the rows and
+columns in the reference image (a stride above 1 leaves pixels out). Lengths are mm, times are frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.errors import MissingExtra
+from leafflow_ti.status import ADVICE, Status
+
+if TYPE_CHECKING:
+    import xarray
+
+QUANTITIES: dict[str, tuple[str, str]] = {
+    "disparity": ("px/step", "total disparity per camera step"),
+    "depth": ("mm", "depth of the surface along the optical axis"),
+    "slope_x": ("1", "surface slope dZ/dX"),
+    "slope_y": ("1", "surface slope dZ/dY"),
+    "velocity_x": ("mm/frame", "surface velocity along X"),
+    "velocity_y": ("mm/frame", "surface velocity along Y"),
+    "velocity_z": ("mm/frame", "surface velocity along Z"),
+    "rotation_x": ("rad/frame", "angular velocity of the surface about X"),
+    "rotation_y": ("rad/frame", "angular velocity of the surface about Y"),
+    "rotation_z": ("rad/frame", "angular velocity of the surface about Z"),
+    "acceleration_x": ("mm/frame²", "surface acceleration along X"),
+    "acceleration_y": ("mm/frame²", "surface acceleration along Y"),
+    "acceleration_z": ("mm/frame²", "surface acceleration along Z"),
+    "flow_x": ("px/frame", "optical flow along x"),
+    "flow_y": ("px/frame", "optical flow along y"),
+    "brightness_t": ("1/frame", "relative brightness change per frame"),
+    "brightness_tt": ("1/frame²", "change of the relative brightness change per frame"),
+    "brightness_tx": ("1/(frame px)", "relative brightness change per frame, slope along x"),
+    "brightness_ty": ("1/(frame px)", "relative brightness change per frame, slope along y"),
+    "brightness_sx": ("1/step", "relative brightness change per camera step along x"),
+    "brightness_sy": ("1/step", "relative brightness change per camera step along y"),
+    "growth_rate": ("%/frame", "relative growth rate of the surface area"),
+}
+"""Name of a map -> (unit, long name). Every map may have a companion ``NAME_std``, its standard error."""
+
+
+def quantity(name: str) -> tuple[str, str]:
+    """Unit and long name of the map ``name``, standard errors (``NAME_std``) included.
+
+    Raises KeyError, naming the known ones, for a name that is no map.
+    """
+    base = name.removesuffix("_std")
+    if base not in QUANTITIES:
+        raise KeyError(f"no map is called {name!r}; known: {', '.join(QUANTITIES)}, each also with _std")
+    unit, long_name = QUANTITIES[base]
+    return unit, long_name if base == name else f"standard error of the {long_name}"
+
+
+def map_attributes(name: str) -> dict[str, Any]:
+    """CF attributes of the map ``name``, or of ``"status"``: units, long name, meanings of the flags."""
+    if name == "status":
+        return {
+            "long_name": "status of the estimate",
+            "flag_values": [int(code) for code in Status],
+            "flag_meanings": " ".join(code.name.lower() for code in Status),
+            "comment": "; ".join(f"{code.name.lower()}: {ADVICE[code]}" for code in Status),
+        }
+    unit, long_name = quantity(name)
+    return {"units": unit, "long_name": long_name}
+
+
+def status_counts(status: NDArray[np.uint8]) -> dict[str, int]:
+    """Pixels per status name, in the order of the codes; only those that occur.
+
+    Raises ValueError for a code that ``Status`` does not have.
+    """
+    codes, counts = np.unique(status, return_counts=True)
+    return {Status(int(code)).name.lower(): int(n) for code, n in zip(codes, counts, strict=True)}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Field(Mapping[str, NDArray[np.float32]]):
+    """Maps of one frame; ``field["depth"]`` is the map, iteration gives the names.
+
+    ``maps``: name -> float32 ``[y, x]``, names and units as in ``QUANTITIES``, standard errors as ``NAME_std``;
+    ``status``: uint8 ``[y, x]``, codes of ``Status``; ``y``, ``x``: int64 pixel coordinates of rows and columns;
+    ``frame``: index of the reference frame; ``attrs``: how the field was made (configuration, device, timings).
+    Raises ValueError when shapes disagree and KeyError for a name that is no map.
+    """
+
+    maps: Mapping[str, NDArray[np.float32]]
+    status: NDArray[np.uint8]
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    frame: int
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = (self.y.size, self.x.size)
+        shapes = {"status": self.status.shape, **{name: values.shape for name, values in self.maps.items()}}
+        for name, found in shapes.items():
+            if found != shape:
+                raise ValueError(f"{name} has the shape {found}, but y and x have {shape} positions")
+        for name in self.maps:
+            quantity(name)
+
+    def __getitem__(self, name: str) -> NDArray[np.float32]:
+        try:
+            return self.maps[name]
+        except KeyError:
+            raise KeyError(f"this field has no map {name!r}; it has: {', '.join(self.maps)}") from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.maps)
+
+    def __len__(self) -> int:
+        return len(self.maps)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of every map."""
+        return (self.y.size, self.x.size)
+
+    def status_shares(self) -> dict[str, float]:
+        """Share of the pixels [0..1] per status name; only those that occur."""
+        return {name: n / self.status.size for name, n in status_counts(self.status).items()}
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The field as a Dataset with dimensions ``y, x``, the scalar coordinate ``t`` and CF attributes.
+
+        Raises MissingExtra where xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise MissingExtra("xarray", "xarray", "Field.to_xarray") from None
+        arrays = {**self.maps, "status": self.status}
+        return xarray.Dataset(
+            {name: (("y", "x"), values, map_attributes(name)) for name, values in arrays.items()},
+            coords={"y": self.y, "x": self.x, "t": self.frame},
+            attrs=dict(self.attrs),
+        )
+
+    def __repr__(self) -> str:
+        shares = ", ".join(f"{name} {share:.1%}" for name, share in self.status_shares().items())
+        rows, columns = self.shape
+        names = ", ".join(name for name in self.maps if not name.endswith("_std"))
+        return f"<Field frame {self.frame}, {rows} x {columns} (y, x): {names}; {shares}>"

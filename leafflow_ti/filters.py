@@ -1,0 +1,65 @@
+"""Derivative filter sets and window weights (Schuchert 2010, Table 2.1, section 2.2).
+
+One-sided coefficients h0..hR of the antisymmetric derivative D and of the symmetric smoothing B.
+The printed four digits are renormalised so that ``sum r D_r = 1`` and ``sum B = 1`` hold exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_TABLE: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "3x1x1": ((0.0, 0.5), (1.0, 0.0)),
+    "3": ((0.0, 0.5), (0.6326, 0.1837)),
+    "5": ((0.0, 0.3327, 0.0836), (0.4704, 0.2415, 0.0233)),
+    "7": ((0.0, 0.2232, 0.1190, 0.0130), (0.3845, 0.2461, 0.0583, 0.0031)),
+}
+FILTER_SETS = tuple(_TABLE)
+
+
+@dataclass(frozen=True)
+class FilterSet:
+    """Correlation kernels over the offsets ``-radius..radius``: ``derivative`` and ``smooth``."""
+
+    name: str
+    derivative: tuple[float, ...]
+    smooth: tuple[float, ...]
+
+    @property
+    def radius(self) -> int:
+        """Half length: the halo that the filter needs."""
+        return len(self.smooth) // 2
+
+    def kernel(self, differentiate: bool) -> Array:
+        """The derivative or the smoothing kernel, shape (2 radius + 1,)."""
+        return np.array(self.derivative if differentiate else self.smooth)
+
+
+def filter_set(name: str) -> FilterSet:
+    """The filter set of Table 2.1 with this number of taps ("3x1x1", "3", "5" or "7"), renormalised."""
+    d, b = (np.array(h) for h in _TABLE[name])
+    d = d / (2 * np.sum(np.arange(len(d)) * d))
+    b = b / (2 * b.sum() - b[0])
+    return FilterSet(
+        name, tuple(np.concatenate([-d[:0:-1], d]).tolist()), tuple(np.concatenate([b[:0:-1], b]).tolist())
+    )
+
+
+def choose_filter_set(n_samples: int, wanted: str = "5") -> FilterSet | None:
+    """The largest set, at most ``wanted``, that ``n_samples`` samples along an axis allow; None below three samples."""
+    for name in ("7", "5", "3"):
+        if int(name) <= n_samples and int(name) <= int(wanted.split("x")[0]):
+            return filter_set("3x1x1" if wanted == "3x1x1" else name)
+    return None
+
+
+def gaussian_weights(size: int, sigma: float) -> Array:
+    """Gaussian over ``size`` (odd) samples, normalised to sum 1; shape (size,)."""
+    offset = np.arange(size) - size // 2
+    w = np.exp(-0.5 * (offset / sigma) ** 2)
+    return np.asarray(w / w.sum())

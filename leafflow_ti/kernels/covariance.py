@@ -1,0 +1,240 @@
+"""Covariances of the flow parameters, and the geometry that the camera solutions agree on.
+
+``Cov(p_i) = σ_i² ρ J_ff^-1 (J_ff ∘ K_i) J_ff^-1`` for the rows that a fit uses; K_i and the cross terms between two solutions are
+tables (see ``leafflow_ti.sampling``), ρ is the share of the texture's gradient energy that survives one more smoothing.
+"""
+
+import functools
+from types import SimpleNamespace
+
+from leafflow_ti.kernels.dense import dense, tri
+from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.spec import KernelSpec
+from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Region, Value, batch_kernel
+
+
+@functools.cache
+def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
+    """The stages ``motion_covariance`` and ``geometry``."""
+    precise, lanes = spec.precise, spec.lanes
+    small = dense(spec)
+
+    @ti.func
+    def texture_smoothness(pixel: ti.i32, n_pixels: ti.i32, number: ti.template(), J: ti.template()):
+        """The factor ρ of each lane."""
+        rho = ti.Vector.zero(precise, lanes)
+        energy = (number[Number.EXTRA] + 1) * n_pixels + pixel
+        for i in range(lanes):
+            plain = ti.cast(J[energy + i], precise)
+            smooth = ti.cast(J[energy + n_pixels + i], precise)
+            rho[i] = ti.select(plain > 0, ti.min(smooth / plain, precise(1.0)), precise(1.0))
+        return rho
+
+    @ti.func
+    def row_covariance(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, solution: ti.i32, rows_at: ti.i32, n_rows: ti.i32,
+        response_at: ti.i32, cov_at: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """Packed covariance of the parameters listed at ``rows_at`` of one solution; keeps ``J_ff^-1 E``."""
+        flow = number[Number.FLOW]
+        factor = base + number[Region.TENSOR] * stride
+        noise = base + number[Region.NOISE] * stride
+        product = base + number[Region.PRODUCT] * stride
+        for r in range(flow):
+            for c in range(n_rows):
+                # p = s p~: the column of the inverse, in the parameter's own units.
+                unit = ti.select(number[rows_at + c] == r, value[Value.SCALE + r], precise(0.0))
+                at = response_at + (r * n_rows + c) * stride
+                for i in range(lanes):
+                    ws[at + i] = unit
+        small.solve_lower(ws, factor, response_at, flow, n_rows, stride)
+        small.solve_upper(ws, factor, response_at, flow, n_rows, stride)
+        table = Value.RATIO + solution * (flow * (flow + 1) // 2)
+        for r in range(flow):
+            for c in range(r + 1):
+                begin = number[Number.LOWER + tri(r, c)] * n_pixels + pixel
+                s = value[Value.SCALE + r] * value[Value.SCALE + c] * value[table + tri(r, c)]
+                element = ti.Vector.zero(precise, lanes)
+                for i in range(lanes):
+                    element[i] = ti.cast(J[begin + i], precise) * s
+                small.store(ws, noise + tri(r, c) * stride, element)
+        for r in range(flow):
+            for c in range(n_rows):
+                element = ti.Vector.zero(precise, lanes)
+                for m in range(flow):
+                    one = noise + tri(ti.max(r, m), ti.min(r, m)) * stride
+                    two = response_at + (m * n_rows + c) * stride
+                    for i in range(lanes):
+                        element[i] += ws[one + i] * ws[two + i]
+                small.store(ws, product + (r * n_rows + c) * stride, element)
+        factor_of = texture_smoothness(pixel, n_pixels, number, J)
+        variance = base + (number[Region.VARIANCE] + solution) * stride
+        for i in range(lanes):
+            factor_of[i] *= ws[variance + i]
+        for r in range(n_rows):
+            for c in range(r + 1):
+                element = small.dot(ws, response_at + r * stride, n_rows, product + c * stride, n_rows, flow, stride)
+                for i in range(lanes):
+                    element[i] *= factor_of[i]
+                small.store(ws, cov_at + tri(r, c) * stride, element)
+
+    @ti.func
+    def motion_covariance(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+    ):  # fmt: skip
+        """Covariance of the rows of the motion solution."""
+        row_covariance(
+            base, pixel, stride, n_pixels, number[Number.MOTION_SOLUTION], Number.MOTION_ROWS, number[Number.ROWS_T],
+            base + number[Region.RESPONSE_T] * stride, base + number[Region.COV_T] * stride, number, value, J, ws,
+        )  # fmt: skip
+
+    @ti.func
+    def cross_covariance(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, camera: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """Covariance of the rows of one camera solution with those of the motion."""
+        rows_s, rows_t = number[Number.ROWS_S], number[Number.ROWS_T]
+        cross = base + number[Region.CROSS] * stride
+        one_at = base + number[Region.RESPONSE_S] * stride
+        two_at = base + number[Region.RESPONSE_T] * stride
+        factor_of = texture_smoothness(pixel, n_pixels, number, J)
+        first = base + (number[Region.VARIANCE] + camera) * stride
+        second = base + (number[Region.VARIANCE] + number[Number.MOTION_SOLUTION]) * stride
+        for i in range(lanes):
+            factor_of[i] *= ti.sqrt(ti.max(ws[first + i] * ws[second + i], precise(0.0)))
+        for r in range(rows_s):
+            for c in range(rows_t):
+                element = ti.Vector.zero(precise, lanes)
+                for term in range(number[Number.CROSS_TERMS]):
+                    entry = Number.CROSS_AB + (camera * 9 + term) * 3
+                    a, b = number[entry], number[entry + 1]
+                    begin = number[entry + 2] * n_pixels + pixel
+                    s = value[Value.CROSS + camera * 9 + term] * value[Value.SCALE + a] * value[Value.SCALE + b]
+                    one = one_at + (a * rows_s + r) * stride
+                    two = two_at + (b * rows_t + c) * stride
+                    for i in range(lanes):
+                        element[i] += s * ti.cast(J[begin + i], precise) * ws[one + i] * ws[two + i]
+                for i in range(lanes):
+                    element[i] *= factor_of[i]
+                small.store(ws, cross + (r * rows_t + c) * stride, element)
+
+    @ti.func
+    def accumulate(base: ti.i32, stride: ti.i32, camera: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()):
+        """Add one camera solution to the normal equations of (nu, b_x, b_y, b_t); its cross disparity is known to be 0."""
+        terms, rows_s, rows_t, flow = number[Number.TERMS], number[Number.ROWS_S], number[Number.ROWS_T], number[Number.FLOW]
+        cov = base + number[Region.COV_S] * stride
+        work = base + number[Region.GEOMETRY_WORK] * stride
+        axis = number[Number.CAMERA_AXIS + camera]
+        step = value[Value.BASELINE + axis]
+        n_used = 2 * terms
+        for r in range(n_used):
+            for c in range(terms):
+                unit = ti.select(r == c, step, precise(0.0))
+                at = work + (r * terms + c) * stride
+                for i in range(lanes):
+                    ws[at + i] = unit
+        if number[Number.WEIGHTED] == 1:
+            small.cholesky(ws, cov, n_used, stride)
+            small.solve_lower(ws, cov, work, n_used, terms, stride)
+            small.solve_upper(ws, cov, work, n_used, terms, stride)
+        else:
+            spread = base + number[Region.GEOMETRY_SPREAD] * stride
+            for r in range(terms):
+                for c in range(r + 1):
+                    at = spread + tri(r, c) * stride
+                    own = cov + tri(r, c) * stride
+                    element = ti.Vector.zero(precise, lanes)
+                    for i in range(lanes):
+                        element[i] = ws[at + i] + step * step * ws[own + i]
+                    small.store(ws, at, element)
+        normal = base + number[Region.GEOMETRY_NORMAL] * stride
+        rhs = base + number[Region.GEOMETRY_RHS] * stride
+        for r in range(terms):
+            for c in range(r + 1):
+                at = normal + tri(r, c) * stride
+                own = work + (r * terms + c) * stride
+                element = ti.Vector.zero(precise, lanes)
+                for i in range(lanes):
+                    element[i] = ws[at + i] + step * ws[own + i]
+                small.store(ws, at, element)
+            element = ti.Vector.zero(precise, lanes)
+            at = rhs + r * stride
+            for i in range(lanes):
+                element[i] = ws[at + i]
+            for m in range(n_used):
+                row = number[Number.CAMERA_ROWS + camera * MAX_ROWS + m]
+                parameter = base + (number[Region.PARAMETERS] + camera * flow + row) * stride
+                weight = work + (m * terms + r) * stride
+                constant = ti.select(m == 0, value[Value.SHIFT + axis], precise(0.0))
+                for i in range(lanes):
+                    element[i] += ws[weight + i] * (ws[parameter + i] + constant)
+            small.store(ws, at, element)
+        if number[Number.MOTION_SOLUTION] >= 0:
+            cross = base + number[Region.CROSS] * stride
+            target = base + number[Region.GEOMETRY_CROSS] * stride
+            for r in range(terms):
+                for c in range(rows_t):
+                    at = target + (r * rows_t + c) * stride
+                    element = small.dot(ws, work + r * stride, terms, cross + c * stride, rows_t, n_used, stride)
+                    for i in range(lanes):
+                        element[i] += ws[at + i]
+                    small.store(ws, at, element)
+
+    @ti.func
+    def geometry(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+    ):  # fmt: skip
+        """Least squares of (nu, b_x, b_y, b_t) per mm over all camera solutions: (3.40), with normals and error bars."""
+        terms, rows_t = number[Number.TERMS], number[Number.ROWS_T]
+        first = base + number[Region.GEOMETRY_NORMAL] * stride
+        for e in range(number[Region.GEOMETRY_COV] - number[Region.GEOMETRY_NORMAL]):
+            for i in range(lanes):
+                ws[first + e * stride + i] = precise(0.0)
+        cross = base + number[Region.GEOMETRY_CROSS] * stride
+        for e in range(terms * rows_t):
+            for i in range(lanes):
+                ws[cross + e * stride + i] = precise(0.0)
+        for camera in range(number[Number.CAMERA_SOLUTIONS]):
+            row_covariance(
+                base, pixel, stride, n_pixels, camera, Number.CAMERA_ROWS + camera * MAX_ROWS, number[Number.ROWS_S],
+                base + number[Region.RESPONSE_S] * stride, base + number[Region.COV_S] * stride, number, value, J, ws,
+            )  # fmt: skip
+            if number[Number.MOTION_SOLUTION] >= 0:
+                cross_covariance(base, pixel, stride, n_pixels, camera, number, value, J, ws)
+            brightness_std(base, stride, camera, number, ws)
+            accumulate(base, stride, camera, number, value, ws)
+        normal = base + number[Region.GEOMETRY_NORMAL] * stride
+        result = base + number[Region.GEOMETRY] * stride
+        rhs = base + number[Region.GEOMETRY_RHS] * stride
+        cov = base + number[Region.GEOMETRY_COV] * stride
+        small.cholesky(ws, normal, terms, stride)
+        small.copy(ws, rhs, result, terms, stride)
+        small.solve_lower(ws, normal, result, terms, 1, stride)
+        small.solve_upper(ws, normal, result, terms, 1, stride)
+        small.solve_lower(ws, normal, cross, terms, rows_t, stride)
+        small.solve_upper(ws, normal, cross, terms, rows_t, stride)
+        if number[Number.WEIGHTED] == 1:
+            small.set_identity(ws, cov, terms, stride)
+        else:
+            small.unpack(ws, base + number[Region.GEOMETRY_SPREAD] * stride, cov, terms, stride)
+            small.solve_lower(ws, normal, cov, terms, terms, stride)
+            small.solve_upper(ws, normal, cov, terms, terms, stride)
+            small.transpose(ws, cov, terms, stride)
+        small.solve_lower(ws, normal, cov, terms, terms, stride)
+        small.solve_upper(ws, normal, cov, terms, terms, stride)
+
+    @ti.func
+    def brightness_std(base: ti.i32, stride: ti.i32, camera: ti.i32, number: ti.template(), ws: ti.template()):
+        """Keep the variance of the brightness row, which the next camera solution would overwrite."""
+        if number[Number.ROWS_S] > 2 * number[Number.TERMS]:
+            last = number[Number.ROWS_S] - 1
+            small.copy(
+                ws, base + (number[Region.COV_S] + tri(last, last)) * stride,
+                base + (number[Region.BRIGHTNESS_VARIANCE] + camera) * stride, 1, stride,
+            )  # fmt: skip
+
+    return SimpleNamespace(**{f.__name__: batch_kernel(spec, f) for f in (motion_covariance, geometry)})

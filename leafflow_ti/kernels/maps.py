@@ -1,0 +1,136 @@
+"""Named maps with standard errors, and the status of each pixel, from the results in the workspace."""
+
+import functools
+from enum import IntEnum
+
+from leafflow_ti.kernels.dense import tri
+from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.patch_fit import patch_functions
+from leafflow_ti.kernels.spec import KernelSpec
+from leafflow_ti.kernels.workspace import Number, Region, Value, batch_kernel
+from leafflow_ti.status import Status
+
+
+class Output(IntEnum):
+    """Planes of the output stack; the standard error of plane p is plane ``STD + p``."""
+
+    DISPARITY = 0
+    DEPTH = 1
+    SLOPE_X = 2
+    SLOPE_Y = 3
+    MOTION = 4  # 9: velocity, rotation, acceleration
+    FLOW_X = 13
+    FLOW_Y = 14
+    BRIGHTNESS = 15  # 3, in the order of the solutions
+    STD = 18
+    STATUS = 36
+    PLANES = 37
+
+
+@functools.cache
+def maps_kernel(spec: KernelSpec):
+    """The stage that writes the output planes."""
+    real, precise, lanes = spec.real, spec.precise, spec.lanes
+    patch = patch_functions(spec)
+    ok, no_structure, aperture, incoherent = (
+        int(s) for s in (Status.OK, Status.NO_STRUCTURE, Status.APERTURE, Status.INCOHERENT)
+    )
+    not_converged, border = int(Status.NOT_CONVERGED), int(Status.BORDER)
+
+    @ti.func
+    def put(out: ti.template(), plane: ti.i32, pixel: ti.i32, n_pixels: ti.i32, value: precise, variance: precise):
+        out[plane * n_pixels + pixel] = ti.cast(value, real)
+        out[(Output.STD + plane) * n_pixels + pixel] = ti.cast(ti.sqrt(ti.max(variance, precise(0.0))), real)
+
+    @ti.func
+    def classify(
+        base: ti.i32, at: ti.i32, i: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
+    ) -> ti.i32:  # fmt: skip
+        """The first of: border, no structure, incoherent, not converged, aperture, ok."""
+        ix, iy = number[Number.FLOW_ROWS], number[Number.FLOW_ROWS + 1]
+        xx = ti.cast(J[number[Number.LOWER + tri(ix, ix)] * n_pixels + at], precise)
+        xy = ti.cast(J[number[Number.LOWER + tri(iy, ix)] * n_pixels + at], precise)
+        yy = ti.cast(J[number[Number.LOWER + tri(iy, iy)] * n_pixels + at], precise)
+        mass = ti.cast(J[number[Number.EXTRA] * n_pixels + at], precise)
+        noise = precise(0.0)
+        energy = precise(0.0)
+        for j in range(number[Number.SOLUTIONS]):
+            variance = ws[base + (number[Region.VARIANCE] + j) * stride + i]
+            noise += variance / ti.cast(number[Number.SOLUTIONS], precise)
+            energy += variance * value[Value.NOISE + number[Number.FLOW] + j]
+        gain = value[Value.GAIN]
+        half = (xx + yy) / 2
+        weakest = half - ti.sqrt(ti.max(half * half - (xx * yy - xy * xy), precise(0.0)))
+        result = ti.cast(ok, ti.i32)
+        if mass < value[Value.MIN_MASS]:
+            result = border
+        elif not (half > precise(1e-12) * mass and half > 2 * noise * gain):
+            result = no_structure
+        elif not (energy < value[Value.MAX_RESIDUAL] * value[Value.MAX_RESIDUAL] * 2 * half):
+            result = incoherent
+        elif ws[base + number[Region.CONVERGED] * stride + i] < 0.5:
+            result = not_converged
+        elif weakest < 2 * noise * gain or weakest < precise(1e-4) * half:
+            result = aperture
+        return result
+
+    @ti.func
+    def maps(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+    ):  # fmt: skip
+        """Write every plane of ``Output`` that the model has."""
+        flow, terms, n = number[Number.FLOW], number[Number.TERMS], number[Number.UNKNOWNS]
+        solution = number[Number.MOTION_SOLUTION]
+        f = value[Value.F]
+        for i in range(lanes):
+            at = pixel + i
+            out[Output.STATUS * n_pixels + at] = ti.cast(
+                classify(base, at, i, stride, n_pixels, number, value, J, ws), real
+            )
+            if terms > 0:
+                g = base + number[Region.GEOMETRY] * stride + i
+                cov = base + number[Region.GEOMETRY_COV] * stride + i
+                nu = ws[g]
+                step = value[Value.BASELINE + number[Number.CAMERA_AXIS]]
+                put(out, Output.DISPARITY, at, n_pixels, nu * step, ws[cov] * step * step)
+                Z0 = -f / nu
+                put(out, Output.DEPTH, at, n_pixels, Z0, ws[cov] * (Z0 / nu) * (Z0 / nu))
+                if terms > 1:
+                    ray = patch.pixel_ray(at, number, value)
+                    b = ti.Vector([ws[g + stride], ws[g + 2 * stride]], dt=precise)
+                    s = patch.surface(ray, f, nu, b[0], b[1])
+                    c = s[3]
+                    for k in ti.static(range(2)):
+                        # slope = c b Z0, and c depends on both: gradient by (nu, b_x, b_y).
+                        own = Z0 * b[k]
+                        gradient = ti.Vector.zero(precise, 3)
+                        gradient[0] = c * (-own / nu) * (1 - c * own * ray[k]) + c * c * own * Z0 * b[1 - k] * ray[1 - k] / nu
+                        gradient[1 + k] = c * Z0 * (1 - c * own * ray[k])
+                        gradient[2 - k] = -c * c * own * Z0 * ray[1 - k]
+                        variance = precise(0.0)
+                        for r in ti.static(range(3)):
+                            for m in ti.static(range(3)):
+                                variance += gradient[r] * ws[cov + (r * terms + m) * stride] * gradient[m]
+                        put(out, Output.SLOPE_X + k, at, n_pixels, s[1 + k], variance)
+            for j in range(n):
+                q = base + (number[Region.MOTION] + j) * stride + i
+                cov = base + (number[Region.MOTION_COV] + j * n + j) * stride + i
+                put(out, Output.MOTION + j, at, n_pixels, ws[q], ws[cov])
+            rows = base + number[Region.COV_T] * stride + i
+            if solution >= 0:
+                for k in range(2):
+                    row = k * number[Number.OFFSETS]
+                    p = base + (number[Region.PARAMETERS] + solution * flow + number[Number.FLOW_ROWS + k]) * stride + i
+                    put(out, Output.FLOW_X + k, at, n_pixels, ws[p], ws[rows + tri(row, row) * stride])
+            for j in range(number[Number.SOLUTIONS]):
+                if number[Number.BRIGHTNESS_COLUMN] >= 0:
+                    p = base + (number[Region.PARAMETERS] + j * flow + number[Number.BRIGHTNESS_COLUMN]) * stride + i
+                    variance = ws[base + (number[Region.BRIGHTNESS_VARIANCE] + j) * stride + i]
+                    if j == solution:
+                        last = number[Number.ROWS_T] - 1
+                        variance = ws[rows + tri(last, last) * stride]
+                    put(out, Output.BRIGHTNESS + j, at, n_pixels, -ws[p], variance)
+
+    return batch_kernel(spec, maps)

@@ -1,0 +1,32 @@
+"""What a kernel is compiled for: structure only, never a value.
+
+A *group* is ``lanes`` neighbouring pixels that are worked on together. On the CPU the lanes are the innermost, vectorised loop,
+and a few tasks share the groups; on a GPU a group is one pixel and every group a thread.
+"""
+
+from dataclasses import dataclass
+
+from leafflow_ti.kernels.engine import ti
+
+TASK_GRAIN = 512
+"""Iterations that the engine's CPU thread pool hands out at once; a task occupies exactly one such piece."""
+
+
+@dataclass(frozen=True)
+class KernelSpec:
+    """``storage``: type of images and moments; ``algebra``: type of the small dense matrices; "f32" or "f64"."""
+
+    storage: str = "f32"
+    algebra: str = "f64"
+    lanes: int = 32
+    gpu: bool = False
+
+    @property
+    def real(self):
+        """Engine type of images and moments."""
+        return getattr(ti, self.storage)
+
+    @property
+    def precise(self):
+        """Engine type of the small dense matrices."""
+        return getattr(ti, self.algebra)

@@ -1,0 +1,229 @@
+"""What the per-pixel kernels share: the workspace of a batch of pixels, and the tables that describe a model to them.
+
+Every per-pixel stage is a function of one group of pixels. It works in regions of one flat workspace (see ``dense``) and
+reads what it needs to know from two tables: ``number`` (int32: region offsets, sizes, lists of rows) and ``value`` (scales,
+noise factors, camera). One compilation of a stage serves every model.
+"""
+
+import functools
+from dataclasses import dataclass
+from enum import IntEnum, auto
+
+import numpy as np
+
+from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
+
+BLOCK = 4
+"""Vectors that the block inverse iteration carries: the solutions and at least one guard."""
+MAX_UNKNOWNS = 9
+MAX_ROWS = 16
+MAX_COLUMNS = 32
+
+
+class Region(IntEnum):
+    """Regions; shapes with N columns, k solutions, F = N - k, S and T rows of a camera solution
+    and of the motion solution, G geometry terms, M equations of the motion fit."""
+
+    TENSOR = 0  # packed [N]: scaled structure tensor, then its Cholesky factor
+    VECTORS = auto()  # [N, BLOCK]: null space
+    IMAGES = auto()  # [N, BLOCK]: factor times vectors
+    RITZ = auto()  # [BLOCK, BLOCK]
+    RITZ_VECTORS = auto()  # [BLOCK, BLOCK]
+    FULL = auto()  # [N, N]: for the full Jacobi
+    FULL_VECTORS = auto()  # [N, N]
+    CONVERGED = auto()  # [1]
+    PARAMETERS = auto()  # [k, F]
+    VARIANCE = auto()  # [k]: image noise variance of each residual
+    NOISE = auto()  # packed [F]: noise of the normal equations
+    RESPONSE_S = auto()  # [F, S]: inverse of J_ff for the geometry rows
+    RESPONSE_T = auto()  # [F, T]: for the motion rows
+    PRODUCT = auto()  # [F, max(S, T)]
+    COV_S = auto()  # packed [S]: covariance of the geometry rows of one camera solution
+    COV_T = auto()  # packed [T]: covariance of the motion rows
+    CROSS = auto()  # [S, T]: geometry rows × motion rows
+    BRIGHTNESS_VARIANCE = auto()  # [k]
+    GEOMETRY = auto()  # [G]
+    GEOMETRY_NORMAL = auto()  # packed [G]
+    GEOMETRY_RHS = auto()  # [G]
+    GEOMETRY_SPREAD = auto()  # packed [G]
+    GEOMETRY_COV = auto()  # [G, G]
+    GEOMETRY_CROSS = auto()  # [G, T]
+    GEOMETRY_WORK = auto()  # [S, G]
+    MOTION = auto()  # [9]
+    MOTION_COV = auto()  # [9, 9]
+    DESIGN = auto()  # [M, 9]
+    VALUE = auto()  # [M]
+    WEIGHTED = auto()  # [M, 10]
+    SPREAD = auto()  # packed [M]
+    FACTOR = auto()  # packed [M]
+    TOTAL = auto()  # packed [M]
+    DERIVATIVE = auto()  # [M, G]
+    NORMAL = auto()  # packed [9]
+    MOTION_WORK = auto()  # [M, 9]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Offsets of the regions, in elements, for a model with ``n`` columns and ``k`` solutions."""
+
+    n: int
+    k: int
+    rows_s: int
+    rows_t: int
+    terms: int
+    motion: int
+    full: bool
+
+    @property
+    def sizes(self) -> dict[Region, int]:
+        """Number of elements of each region."""
+        n, k, terms, motion = self.n, self.k, self.terms, self.motion
+        s, t = self.rows_s, self.rows_t
+        flow = n - k
+        full = n * n if self.full else 0
+
+        def packed(m: int) -> int:
+            return m * (m + 1) // 2
+
+        return {
+            Region.TENSOR: packed(n),
+            Region.VECTORS: n * BLOCK,
+            Region.IMAGES: n * BLOCK,
+            Region.RITZ: BLOCK * BLOCK,
+            Region.RITZ_VECTORS: BLOCK * BLOCK,
+            Region.FULL: full,
+            Region.FULL_VECTORS: full,
+            Region.CONVERGED: 1,
+            Region.PARAMETERS: k * flow,
+            Region.VARIANCE: k,
+            Region.NOISE: packed(flow),
+            Region.RESPONSE_S: flow * s,
+            Region.RESPONSE_T: flow * t,
+            Region.PRODUCT: flow * max(s, t),
+            Region.COV_S: packed(s),
+            Region.COV_T: packed(t),
+            Region.CROSS: s * t,
+            Region.BRIGHTNESS_VARIANCE: k,
+            Region.GEOMETRY: terms,
+            Region.GEOMETRY_NORMAL: packed(terms),
+            Region.GEOMETRY_RHS: terms,
+            Region.GEOMETRY_SPREAD: packed(terms),
+            Region.GEOMETRY_COV: terms * terms,
+            Region.GEOMETRY_CROSS: terms * t,
+            Region.GEOMETRY_WORK: s * terms,
+            Region.MOTION: MAX_UNKNOWNS,
+            Region.MOTION_COV: MAX_UNKNOWNS * MAX_UNKNOWNS,
+            Region.DESIGN: motion * MAX_UNKNOWNS,
+            Region.VALUE: motion,
+            Region.WEIGHTED: motion * (MAX_UNKNOWNS + 1),
+            Region.SPREAD: packed(motion),
+            Region.FACTOR: packed(motion),
+            Region.TOTAL: packed(motion),
+            Region.DERIVATIVE: motion * terms,
+            Region.NORMAL: packed(MAX_UNKNOWNS),
+            Region.MOTION_WORK: motion * MAX_UNKNOWNS,
+        }
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """First element of each region, int32 [len(Region)]."""
+        sizes = self.sizes
+        return np.cumsum([0] + [sizes[r] for r in Region][:-1]).astype(np.int32)
+
+    @property
+    def n_elements(self) -> int:
+        """Elements per pixel."""
+        return sum(self.sizes.values())
+
+
+class Number(IntEnum):
+    """Positions in the table ``number``, behind the offsets of the regions; lists occupy several places."""
+
+    N = len(Region)  # columns
+    SOLUTIONS = auto()  # k
+    FLOW = auto()  # F = N - k
+    WITH_FULL = auto()  # the full Jacobi is wanted: load the square matrix too
+    ITERATIONS = auto()  # of the block inverse iteration
+    MOTION_SOLUTION = auto()  # index of the solution along t, or -1
+    TERMS = auto()  # G: geometry terms (1, x, y, t), 0 without a grid
+    OFFSETS = auto()  # number of motion offsets
+    ROWS_S = auto()  # rows of a camera solution: 2 G, and one for brightness if the model has it
+    ROWS_T = auto()  # rows of the motion solution: 2 OFFSETS, and one for brightness
+    USE_RANGE = auto()
+    UNKNOWNS = auto()  # of the motion fit; 0 without one
+    WEIGHTED = auto()  # weighted least squares, else plain
+    PASSES = auto()  # of the motion fit
+    BRIGHTNESS_COLUMN = auto()  # column of I, or -1
+    CROSS_TERMS = auto()  # per pair (camera solution, motion)
+    RANGE_TERM = auto()  # index of t among the geometry terms
+    CAMERA_SOLUTIONS = auto()  # number of solutions along camera axes
+    OUT_X = auto()  # pixel coordinates of the output grid: x = OUT_X + STEP column
+    OUT_Y = auto()
+    STEP = auto()
+    PITCH = auto()
+    EXTRA = auto()  # first J plane behind the tensor: window mass, gradient energy, smoothed energy
+    FLOW_ROWS = auto()  # 2: columns of the motion itself
+    OFFSET_CODES = FLOW_ROWS + 2  # 6: offset of each motion row: 0 = "1", 1.. = AXES
+    MOTION_ROWS = OFFSET_CODES + 6  # MAX_ROWS: columns of the motion rows
+    CAMERA_ROWS = MOTION_ROWS + MAX_ROWS  # 2 x MAX_ROWS: columns of the geometry rows per camera solution
+    CAMERA_AXIS = CAMERA_ROWS + 2 * MAX_ROWS  # 2: 0 for sx, 1 for sy
+    CROSS_AB = CAMERA_AXIS + 2  # 2 x 9 x 3: a, b, plane of J
+    LOWER = CROSS_AB + 54  # N (N + 1) / 2: plane of each element of the lower triangle
+
+
+class Value(IntEnum):
+    """Positions in the table ``value``."""
+
+    RIDGE = 0
+    F = auto()
+    PX = auto()  # principal point
+    PY = auto()
+    BASELINE = auto()  # 2
+    SHIFT = BASELINE + 2  # 2: disparity that the preshift and the rectification took out, px per step
+    STEP_SIZE = SHIFT + 2  # relative step of the finite differences in the motion fit
+    GAIN = auto()  # noise gain of the gradient: x and y
+    MIN_MASS = auto()
+    MAX_RESIDUAL = auto()  # px, for status incoherent
+    GAP = auto()  # convergence: residual per gap
+    SCALE = auto()  # MAX_COLUMNS
+    NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
+    CROSS = NOISE + MAX_COLUMNS  # 2 x 9
+    RATIO = CROSS + 18  # k x packed [F]
+
+
+@functools.cache
+def batch_kernel(spec: KernelSpec, body):
+    """A kernel that applies ``body(base, pixel, stride, n_pixels, number, value, J, ws, out)`` to every group of a batch.
+
+    ``base``: the group's place in the workspace; ``pixel``: its first pixel; ``stride``: distance of workspace elements.
+    """
+    real, precise, lanes = spec.real, spec.precise, spec.lanes
+
+    @ti.kernel
+    def batch(
+        first_pixel: ti.i32,
+        n_pixels: ti.i32,
+        n_groups: ti.i32,
+        group_step: ti.i32,
+        stride: ti.i32,
+        n_tasks: ti.i32,
+        number_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [Number.LOWER + N (N + 1) / 2]
+        value_in: ti.types.ndarray(dtype=precise, ndim=1),  # [Value.RATIO + k F (F + 1) / 2]
+        J_in: ti.types.ndarray(dtype=real, ndim=1),  # [n_planes * n_pixels]
+        ws_io: ti.types.ndarray(dtype=precise, ndim=1),  # [n_groups * n_elements * lanes]
+        map_out: ti.types.ndarray(dtype=real, ndim=1),  # [n_maps * n_pixels]
+    ):
+        if ti.static(spec.gpu):
+            for g in range(n_groups):
+                body(g * group_step, first_pixel + g * lanes, stride, n_pixels, number_in, value_in, J_in, ws_io, map_out)
+        else:
+            for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
+                if part == 0:
+                    for g in range(task * n_groups // n_tasks, (task + 1) * n_groups // n_tasks):
+                        body(
+                            g * group_step, first_pixel + g * lanes, stride, n_pixels,
+                            number_in, value_in, J_in, ws_io, map_out,
+                        )  # fmt: skip
+
+    return batch

@@ -1,0 +1,257 @@
+"""Results store: a Zarr v3 directory with one array ``[t, y, x]`` per map, filled unit by unit.
+
+A unit is one band of output rows of one frame and exactly one chunk of every array, so units never share a file and
+may be written in any order, by any number of writers. Its marker ``status/.done/UNIT`` is written last: a unit with a
+marker is complete, one without is computed again. The markers lie inside an array's folder because readers of Zarr
+list the folders of groups, where a foreign entry would be reported, but never those of arrays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import zarr
+from numpy.typing import ArrayLike, NDArray
+from zarr.errors import NodeNotFoundError
+
+from leafflow_ti.errors import InputError, RunError, UsageError
+from leafflow_ti.field import QUANTITIES, Field, map_attributes
+from leafflow_ti.status import Status
+
+FORMAT = 1
+"""Version of the layout, in the attribute ``leafflow_ti_format`` by which a store is recognised."""
+
+_COORDINATES: dict[str, dict[str, Any]] = {
+    "t": {"long_name": "index of the reference frame", "units": "frame"},
+    "y": {"long_name": "row in the reference image, downwards", "units": "px"},
+    "x": {"long_name": "column in the reference image, to the right", "units": "px"},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ResultStore:
+    """An open results store. ``frames``, ``y``, ``x``: coordinates of the axes t, y, x; ``names``: its maps."""
+
+    path: Path
+    frames: tuple[int, ...]
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    names: tuple[str, ...]
+    unit_rows: int
+    _group: zarr.Group
+    _arrays: Mapping[str, zarr.Array[Any]]
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        *,
+        frames: Sequence[int],
+        y: ArrayLike,
+        x: ArrayLike,
+        names: Sequence[str],
+        chunk: tuple[int, int, int],
+        attrs: Mapping[str, Any],
+        interval_s: float | None = None,
+        overwrite: bool = False,
+    ) -> Self:
+        """A new store, every map preallocated with NaN and the status with ``NOT_COMPUTED``.
+
+        ``y``, ``x``: pixel positions of the rows and columns; ``chunk``: ``(1, rows of a unit, len(x))``; ``attrs``:
+        JSON values; ``interval_s``: time between frames [s]. The store appears under its name only when it is whole.
+        Raises UsageError when ``path`` exists (``overwrite`` replaces a results store, nothing else), RunError when it
+        cannot be written.
+        """
+        path = Path(path)
+        frames, names = tuple(int(t) for t in frames), tuple(names)
+        coordinates = {"t": np.asarray(frames, np.int64), "y": np.asarray(y, np.int64), "x": np.asarray(x, np.int64)}
+        shape = tuple(values.size for values in coordinates.values())
+        if chunk[0] != 1 or not 1 <= chunk[1] <= shape[1] or chunk[2] != shape[2]:
+            raise ValueError(f"chunk {chunk} must be (1, 1..{shape[1]}, {shape[2]}): whole rows of one frame")
+        _check_replaceable(path, overwrite)
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            scratch = path.with_name(f".{path.name}.{os.getpid()}")
+            try:
+                group = zarr.create_group(scratch, zarr_format=3)
+                group.update_attributes({"Conventions": "CF-1.11", **attrs, "leafflow_ti_format": FORMAT})
+                for axis, values in coordinates.items():
+                    attributes = dict(_COORDINATES[axis])
+                    if axis == "t" and interval_s is not None:
+                        attributes["interval_s"] = float(interval_s)
+                    group.create_array(axis, data=values, dimension_names=[axis], attributes=attributes)
+                for name in (*names, "status"):
+                    attributes = map_attributes(name)
+                    if f"{name}_std" in names:
+                        attributes["ancillary_variables"] = f"{name}_std status"
+                    group.create_array(
+                        name,
+                        shape=shape,
+                        chunks=chunk,
+                        dtype="uint8" if name == "status" else "float32",
+                        fill_value=int(Status.NOT_COMPUTED) if name == "status" else float("nan"),
+                        dimension_names=list(coordinates),
+                        attributes=attributes,
+                    )
+                (scratch / "status" / ".done").mkdir()
+                if path.exists():
+                    shutil.rmtree(path)
+                scratch.rename(path)
+            except BaseException:
+                shutil.rmtree(scratch, ignore_errors=True)
+                raise
+        return cls.open(path)
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """An existing store, to read or to go on writing; InputError when ``path`` is none."""
+        path = Path(path)
+        group = _open_group(path)
+        if group is None:
+            raise InputError(f"{path}: no results store; give the OUT.zarr of a 'leafflow-ti run'")
+        found = group.attrs["leafflow_ti_format"]
+        if found != FORMAT:
+            raise InputError(
+                f"{path}: written in format {found}, this version reads {FORMAT}: run again with --overwrite"
+            )
+        arrays = dict(group.arrays())
+        t, y, x = (np.asarray(arrays[axis][...], np.int64) for axis in ("t", "y", "x"))
+        names = tuple(n for base in QUANTITIES for n in (base, f"{base}_std") if n in arrays)
+        return cls(path, tuple(t.tolist()), y, x, names, arrays["status"].chunks[1], group, arrays)
+
+    @property
+    def attrs(self) -> dict[str, Any]:
+        """Attributes of the store: resolved configuration, versions, device, fingerprints, timings."""
+        return dict(self._group.attrs)
+
+    @property
+    def interval_s(self) -> float | None:
+        """Time between frames [s], None when unknown."""
+        value = self._arrays["t"].attrs.get("interval_s")
+        return float(value) if isinstance(value, int | float) else None
+
+    @property
+    def bands(self) -> int:
+        """Units per frame; unit ``t_index * bands + band`` holds the rows from ``band * unit_rows``."""
+        return -(-self.y.size // self.unit_rows)
+
+    @property
+    def n_units(self) -> int:
+        """Units of the whole store."""
+        return len(self.frames) * self.bands
+
+    def write_unit(
+        self, unit: int, t_index: int, y: slice, maps: Mapping[str, NDArray[np.floating]], status: NDArray[np.uint8]
+    ) -> None:
+        """Write one unit, then its marker, both forced to the disk.
+
+        ``y``: the output rows of the unit; ``maps``: every map of the store, ``[rows, len(x)]``; ``status`` likewise.
+        Raises RunError when the disk is full or not writable, ValueError when the arguments do not describe the unit.
+        """
+        frame, band = divmod(unit, self.bands)
+        first = band * self.unit_rows
+        rows = slice(first, min(first + self.unit_rows, self.y.size))
+        if (
+            not 0 <= unit < self.n_units
+            or t_index != frame
+            or (y.start, y.stop, y.step or 1) != (rows.start, rows.stop, 1)
+        ):
+            raise ValueError(f"unit {unit} is frame {frame}, rows {rows}; got frame {t_index}, rows {y}")
+        shape = (rows.stop - rows.start, self.x.size)
+        arrays: dict[str, NDArray[Any]] = {name: maps[name] for name in self.names} | {"status": status}
+        wrong = [name for name, values in arrays.items() if values.shape != shape]
+        if wrong:
+            raise ValueError(f"unit {unit} needs the shape {shape}; {wrong[0]} has {arrays[wrong[0]].shape}")
+        with _writing(self.path):
+            for name, values in arrays.items():
+                self._arrays[name][t_index, rows] = values
+                # A chunk that holds nothing but the fill value has no file.
+                _flush(self.path / name / "c" / str(t_index) / str(band) / "0", missing_ok=True)
+            self._mark(unit)
+
+    def _mark(self, unit: int) -> None:
+        folder = self.path / "status" / ".done"
+        scratch = folder / f".{unit}.{os.getpid()}"
+        scratch.touch()
+        _flush(scratch)
+        scratch.replace(folder / str(unit))
+        _flush(folder)
+
+    def done(self) -> set[int]:
+        """Units whose marker is written."""
+        return {int(entry.name) for entry in (self.path / "status" / ".done").iterdir() if entry.name.isdecimal()}
+
+    def read(self, name: str, t_index: int | None = None) -> NDArray[Any]:
+        """A map or ``"status"``: ``[t, y, x]``, or ``[y, x]`` of the frame with index ``t_index`` along t.
+
+        Raises InputError for a name that the store does not have.
+        """
+        if name not in (*self.names, "status"):
+            raise InputError(f"{self.path}: has no map {name!r}; it has: {', '.join(self.names)}")
+        return np.asarray(self._arrays[name][... if t_index is None else t_index])
+
+    def field(self, t_index: int) -> Field:
+        """All maps of the frame with index ``t_index`` along t."""
+        maps = {name: self.read(name, t_index) for name in self.names}
+        return Field(maps, self.read("status", t_index), self.y, self.x, self.frames[t_index], self.attrs)
+
+    def finish(self, attrs: Mapping[str, Any]) -> None:
+        """Add the attributes known at the end (timings, device).
+
+        Raises RunError when units are missing or the store cannot be written.
+        """
+        missing = self.n_units - len(self.done())
+        if missing:
+            raise RunError(f"{self.path}: {missing} of {self.n_units} units are not done: run again with --resume")
+        with _writing(self.path):
+            self._group.update_attributes(dict(attrs))
+
+
+def _open_group(path: Path) -> zarr.Group | None:
+    """The group of a results store; None for anything else."""
+    try:
+        group = zarr.open_group(path, mode="r+", zarr_format=3)
+    except (NodeNotFoundError, OSError, ValueError):
+        return None
+    return group if "leafflow_ti_format" in group.attrs else None
+
+
+def _check_replaceable(path: Path, overwrite: bool) -> None:
+    if not path.exists():
+        return
+    if not overwrite:
+        raise UsageError(f"{path} exists: give --overwrite to replace it, --resume to continue it, or another name")
+    if _open_group(path) is None:
+        raise UsageError(f"{path} exists and is no results store, so --overwrite leaves it alone: give another name")
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise RunError(f"{path}: cannot be written ({reason}): mend that, then run again with --resume") from error
+
+
+def _flush(path: Path, missing_ok: bool = False) -> None:
+    """Force a file, or the entries of a folder, to the disk."""
+    if path.is_dir() and os.name == "nt":  # Windows opens no folders and needs no such step
+        return
+    try:
+        handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    except FileNotFoundError:
+        if missing_ok:
+            return
+        raise
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,201 @@
+"""The compute device: the one place that starts the engine, and the arrays that live on the device.
+
+Importing this module starts nothing; ``start()`` does, once per process. A host program that has already initialised the
+engine keeps its settings: they are adopted, never replaced.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import threading
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import platformdirs
+
+from leafflow_ti.errors import DeviceError
+
+if TYPE_CHECKING:
+    from leafflow_ti.kernels.spec import KernelSpec
+
+ARCHES = ("cuda", "metal", "vulkan", "cpu")
+PLANE_LANES = 64
+DENSE_LANES = {"f32": 32, "f64": 16}
+_lock = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where kernels run, and in which precision.
+
+    ``storage`` is the type of images and moments, ``algebra`` that of the small dense matrices.
+    """
+
+    arch: str
+    threads: int
+    storage: str = "f32"
+    algebra: str = "f64"
+
+    @property
+    def gpu(self) -> bool:
+        """Whether arrays live in device memory."""
+        return self.arch != "cpu"
+
+    def __str__(self) -> str:
+        where = f"cpu ({self.threads} threads)" if self.arch == "cpu" else self.arch
+        return f"{where}, images {self.storage}, algebra {self.algebra}"
+
+    @cached_property
+    def planes(self) -> KernelSpec:
+        """What plane kernels are compiled for."""
+        from leafflow_ti.kernels.spec import KernelSpec
+
+        return KernelSpec(self.storage, self.algebra, 1 if self.gpu else PLANE_LANES, self.gpu)
+
+    @cached_property
+    def dense(self) -> KernelSpec:
+        """What per-pixel kernels are compiled for."""
+        from leafflow_ti.kernels.spec import KernelSpec
+
+        return KernelSpec(self.storage, self.algebra, 1 if self.gpu else DENSE_LANES[self.algebra], self.gpu)
+
+    def tasks(self, n_groups: int) -> int:
+        """Into how many tasks the groups of a launch are cut on the CPU."""
+        return max(1, min(n_groups, 8 * self.threads))
+
+    def real(self, kind: str) -> type[np.floating[Any]]:
+        """NumPy type of "storage" or "algebra"."""
+        return np.float32 if getattr(self, kind) == "f32" else np.float64
+
+    def empty(self, size: int, kind: str = "storage") -> Any:
+        """A flat array of the device, contents undefined; ``kind`` is "storage", "algebra" or "int"."""
+        dtype = np.int32 if kind == "int" else self.real(kind)
+        if not self.gpu:
+            return np.empty(size, dtype)
+        from leafflow_ti.kernels.engine import ti
+
+        return ti.ndarray({np.int32: ti.i32, np.float32: ti.f32, np.float64: ti.f64}[dtype], (size,))
+
+    def array(self, values: Any, kind: str = "storage") -> Any:
+        """A flat array of the device with these values."""
+        host = np.ascontiguousarray(values, np.int32 if kind == "int" else self.real(kind)).ravel()
+        if not self.gpu:
+            return host
+        result = self.empty(host.size, kind)
+        result.from_numpy(host)
+        return result
+
+    def write(self, array: Any, start: int, values: Any) -> None:
+        """Put host values (storage type) into a flat array of the device, from element ``start`` on."""
+        if not self.gpu:
+            array[start : start + values.size] = values.ravel()
+            return
+        from leafflow_ti.kernels.planes import copy_kernel
+
+        copy_kernel(self.planes)(values.size, start, self.array(values), array)
+
+    def host(self, array: Any) -> Any:
+        """The values as a NumPy array; on the CPU the array itself."""
+        return array.to_numpy() if self.gpu else array
+
+    def synchronize(self) -> None:
+        """Wait until every launched kernel has finished."""
+        if self.gpu:
+            from leafflow_ti.kernels.engine import ti
+
+            ti.sync()
+
+
+def cache_folder() -> Path:
+    """A writable folder for compiled kernels: the user's cache, else a temporary one."""
+    wanted = os.environ.get("LEAFFLOW_TI_CACHE")
+    folder = Path(wanted) if wanted else Path(platformdirs.user_cache_dir("leafflow-ti", False)) / "kernels"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="leafflow-ti-kernels-"))
+
+
+def _running() -> str | None:
+    """Arch of an engine that is already initialised."""
+    from leafflow_ti.kernels.engine import ti
+
+    if ti.lang.impl.get_runtime().prog is None:
+        return None
+    name = str(ti.lang.impl.current_cfg().arch).rsplit(".", 1)[-1]
+    return "cpu" if name in ("x64", "arm64") else name
+
+
+def _initialise(arch: str, threads: int) -> bool:
+    from leafflow_ti.kernels.engine import ti
+
+    try:
+        ti.init(
+            arch=getattr(ti, arch),
+            enable_fallback=False,
+            offline_cache=True,
+            offline_cache_file_path=str(cache_folder()),
+            cpu_max_num_threads=threads,
+            log_level=ti.ERROR,
+            verbose=False,
+        )
+    except (RuntimeError, OSError):
+        return False
+    return True
+
+
+def _usable_threads() -> int:
+    with contextlib.suppress(AttributeError):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def start(arch: str = "auto", precision: str = "f32", threads: int | None = None) -> Device:
+    """Start the engine, or adopt the one that runs, and say on what it computes.
+
+    ``arch``: "auto" (``LEAFFLOW_TI_ARCH`` if set, else the first of cuda, metal, vulkan, cpu that starts; a software
+    Vulkan driver counts as none) or one of them. ``precision``: "f32" or "f64", of images and moments; the small dense matrices are
+    always solved in double precision where the device has it.
+
+    Raises DeviceError if the device cannot be started, or another one already runs in this process.
+    """
+    if arch == "auto":
+        arch = os.environ.get("LEAFFLOW_TI_ARCH", "auto")
+    if arch != "auto" and arch not in ARCHES:
+        raise DeviceError(f"arch '{arch}' does not exist; choose auto, {', '.join(ARCHES)}")
+    n_threads = threads or _usable_threads()
+    with _lock:
+        running = _running()
+        if running is None:
+            candidates = ARCHES if arch == "auto" else (arch,)
+            for candidate in candidates:
+                if arch == "auto" and candidate == "vulkan" and _vulkan_is_software():
+                    continue
+                if _initialise(candidate, n_threads):
+                    running = candidate
+                    break
+        if running is None:
+            raise DeviceError(f"device '{arch}' could not be started; use --arch cpu or --arch auto")
+        if arch not in ("auto", running):
+            raise DeviceError(f"device '{arch}' was asked for, but this process already computes on '{running}'")
+    has_double = running in ("cpu", "cuda", "vulkan")
+    if precision == "f64" and not has_double:
+        raise DeviceError(f"precision f64 does not exist on '{running}'; use f32 or --arch cpu")
+    return Device(running, n_threads, precision, "f64" if has_double else "f32")
+
+
+def _vulkan_is_software() -> bool:
+    """Whether no hardware Vulkan driver is installed: then the CPU back end is the faster choice."""
+    roots = [Path("/etc/vulkan/icd.d"), Path("/usr/share/vulkan/icd.d")]
+    chosen = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    files = [Path(p) for p in chosen.split(os.pathsep)] if chosen else [f for r in roots for f in r.glob("*.json")]
+    hardware = [f for f in files if not f.name.startswith("lvp_")]
+    has_card = any(Path("/dev/dri").glob("render*")) or Path("/dev/nvidia0").exists() or os.name == "nt"
+    return not (hardware and has_card)

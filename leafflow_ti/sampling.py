@@ -1,0 +1,176 @@
+"""Filters and window weights along each of the five axes, and what image noise becomes under them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.filters import FilterSet, gaussian_weights
+from leafflow_ti.models import AXES, Column, ColumnSet
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AxisSampling:
+    """One axis: its derivative filters (None: a single sample, no derivative) and its window weights (sum 1)."""
+
+    filters: FilterSet | None = None
+    weights: tuple[float, ...] = (1.0,)
+
+    @classmethod
+    def gaussian(cls, filters: FilterSet | None, size: int, sigma: float) -> AxisSampling:
+        """Window of ``size`` samples with a Gaussian of ``sigma`` samples."""
+        return cls(filters, tuple(gaussian_weights(size, sigma).tolist()))
+
+    @property
+    def size(self) -> int:
+        """Number of window samples."""
+        return len(self.weights)
+
+    @property
+    def filter_radius(self) -> int:
+        """Halo of the filters alone."""
+        return self.filters.radius if self.filters else 0
+
+    @property
+    def radius(self) -> int:
+        """Halo of window and filters together: samples needed on each side of the centre."""
+        return self.size // 2 + self.filter_radius
+
+    def kernel(self, differentiate: bool) -> Array:
+        """Filter kernel along this axis; the identity where there is a single sample."""
+        if self.filters is None:
+            return np.ones(1)
+        return self.filters.kernel(differentiate)
+
+    def window(self, power: int) -> Array:
+        """Weights times the offset to ``power``: ``w(Δ) Δ^power``, shape (size,)."""
+        offset = np.arange(self.size) - self.size // 2
+        return np.asarray(np.array(self.weights) * offset.astype(float) ** power)
+
+    def moment(self, power: int) -> float:
+        """``Σ w(Δ) Δ^power``."""
+        return float(self.window(power).sum())
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The sampling of all five axes."""
+
+    x: AxisSampling
+    y: AxisSampling
+    sx: AxisSampling = AxisSampling()
+    sy: AxisSampling = AxisSampling()
+    t: AxisSampling = AxisSampling()
+
+    def axis(self, name: str) -> AxisSampling:
+        """The sampling along one axis of ``AXES``."""
+        sampling: AxisSampling = getattr(self, name)
+        return sampling
+
+    @property
+    def camera_axes(self) -> tuple[str, ...]:
+        """Camera axes that have a derivative."""
+        return tuple(a for a in ("sx", "sy") if self.axis(a).filters is not None)
+
+    @property
+    def sampled(self) -> tuple[str, ...]:
+        """Axes along which the window holds more than one sample."""
+        return tuple(a for a in AXES if self.axis(a).size > 1)
+
+
+def noise_gain(sampling: Sampling, channel: str) -> float:
+    """Variance of a channel per variance of the image noise: product of the squared filter norms (2.24)."""
+    return float(np.prod([np.sum(sampling.axis(a).kernel(a == channel) ** 2) for a in AXES]))
+
+
+def column_noise(sampling: Sampling, columns: ColumnSet) -> Array:
+    """Diagonal of ``C = Σ w C_i``, the noise covariance of the columns summed over the window; shape (N,).
+
+    For symmetric windows C is diagonal: the filters of different channels are orthogonal, and odd moments vanish.
+    """
+
+    def of(column: Column) -> float:
+        moments = [sampling.axis(a).moment(2 * e) for a, e in zip(AXES, column.exponents, strict=True)]
+        return noise_gain(sampling, column.channel) * float(np.prod(moments))
+
+    return np.array([of(c) for c in columns.columns])
+
+
+def _pixel_factor(axis: AxisSampling, m: int, n: int) -> float:
+    """Ratio of the moments of w² and w along an image axis; the geometric mean where an odd moment vanishes."""
+
+    def ratio(power: int) -> float:
+        return float(np.sum(np.array(axis.weights) * axis.window(power)) / axis.moment(power))
+
+    return ratio(m + n) if (m + n) % 2 == 0 else float(np.sqrt(ratio(2 * m) * ratio(2 * n)))
+
+
+def _series_factor(axis: AxisSampling, differentiate: bool, m: int, n: int) -> float:
+    """Exact noise of a weighted sum of filtered samples along a camera or time axis, relative to the moment of w."""
+    if (m + n) % 2:
+        return 0.0
+    h = axis.kernel(differentiate)[::-1]
+    noise = np.dot(np.convolve(h, axis.window(m)), np.convolve(h, axis.window(n)))
+    return float(noise / axis.moment(m + n))
+
+
+def noise_ratio(sampling: Sampling, columns: ColumnSet, solution: str) -> Array:
+    """Table K with ``Cov(Σ w f n) = σ² ρ J_ff ∘ K`` for the solution along ``solution``; shape (n_flow, n_flow).
+
+    ``f`` are the columns that are not time-like and ``n`` the residual that image noise of variance σ² leaves. In the
+    frame that moves with the texture, n is the derivative of the noise along ``solution`` smoothed along all other
+    axes; f is then constant along camera and time axes, where the few samples are summed exactly (the noise of a
+    derivative telescopes there). In x and y, w is smooth on the scale of the filters, so the sum runs over w², and
+    the smoothing meets the texture's own spectrum: that is the factor ρ, measured per pixel.
+    """
+
+    def factor(a: Column, b: Column) -> float:
+        product = 1.0
+        for name, m, n in zip(AXES, a.exponents, b.exponents, strict=True):
+            axis = sampling.axis(name)
+            if name in ("x", "y"):
+                product *= _pixel_factor(axis, m, n)
+            else:
+                product *= _series_factor(axis, name == solution, m, n)
+        return product
+
+    flow = columns.columns[: columns.n_flow]
+    return np.array([[factor(a, b) for b in flow] for a in flow])
+
+
+@dataclass(frozen=True)
+class CrossTerm:
+    """``Cov(Σ w f_a n_i, Σ w f_b n_j) = σ² ρ J[base_a, base_b] value`` for two different solutions i, j."""
+
+    a: int
+    b: int
+    base_a: int
+    base_b: int
+    value: float
+
+
+def cross_noise(sampling: Sampling, columns: ColumnSet, first: str, second: str) -> tuple[CrossTerm, ...]:
+    """The covariances between two solutions that do not vanish by symmetry.
+
+    ``∂/∂t`` of the disparity and ``∂/∂s`` of the motion are the same mixed derivative, measured twice from the same
+    noise: only the pairs (offset along the other's axis) × (offset along one's own axis) are correlated.
+    """
+    one, two = sampling.axis(first), sampling.axis(second)
+
+    def series(axis: AxisSampling, derivative_power: int, smooth_power: int) -> float:
+        d, b = axis.kernel(True)[::-1], axis.kernel(False)[::-1]
+        return float(np.dot(np.convolve(d, axis.window(derivative_power)), np.convolve(b, axis.window(smooth_power))))
+
+    value = series(one, 0, 1) * series(two, 0, 1) * _pixel_factor(sampling.x, 0, 0) * _pixel_factor(sampling.y, 0, 0)
+    terms = []
+    for p in ("x", "y", "i"):
+        for q in ("x", "y", "i"):
+            a, b = columns.index(p, second), columns.index(q, first)
+            base_a, base_b = columns.index(p), columns.index(q)
+            if a is not None and b is not None and base_a is not None and base_b is not None:
+                terms.append(CrossTerm(a, b, base_a, base_b, value))
+    return tuple(terms)

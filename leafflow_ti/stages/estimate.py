@@ -1,0 +1,229 @@
+"""Per-pixel stages: structure tensors of a band to named maps, batch by batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.models import AXES, MOTION_UNKNOWNS, ColumnSet, TensorLayout
+from leafflow_ti.runtime import Device
+from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_gain, noise_ratio
+from leafflow_ti.stages.estimators import ESTIMATORS
+
+BATCH_BYTES = 8 << 20
+"""Workspace of one batch of pixels: it should stay in the processor's cache."""
+RIDGE = {"f64": 1e-13, "f32": 1e-7}
+GAP = {"f64": 1e-6, "f32": 1e-3}
+STEP_SIZE = {"f64": 1e-4, "f32": 1e-2}
+MIN_MASS = 0.2
+"""Least share of the window's weight that must lie inside the images (a corner pixel has 1/4)."""
+MAX_RESIDUAL_PX = 0.5
+"""Root mean square misfit of the brightness constraint, as a displacement, above which a window is incoherent."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is estimated: columns, geometry terms, motion rows; independent of band and device.
+
+    ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``unknowns`` of the motion fit (0: none).
+    """
+
+    columns: ColumnSet
+    sampling: Sampling
+    estimator: str = "tls-equilibrated"
+    solver: str = "fast"
+    weighted: bool = True
+    offsets: tuple[str, ...] = ("1",)
+    use_range: bool = False
+    unknowns: int = 0
+    passes: int = 3
+    iterations: int = 4
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Geometry terms: the offsets of the disparity that enter the surface fit."""
+        if not self.camera_axes:
+            return ()
+        return tuple(o for o in ("1", "x", "y", "t") if self.columns.index("x", o) is not None)
+
+    @property
+    def camera_axes(self) -> tuple[str, ...]:
+        """Camera axes with a solution."""
+        return tuple(a for a in self.columns.solutions if a != "t")
+
+
+def unknowns_of(motion: str, columns: ColumnSet) -> int:
+    """Number of motion unknowns: 3 per group; without offsets along x, y the velocity along Z is taken as zero."""
+    if columns.index("x", "x") is None:
+        return 2
+    return 3 * len(MOTION_UNKNOWNS[motion])
+
+
+@dataclass(frozen=True)
+class View:
+    """Camera and output grid of one band: pixel (row, col) lies at (x + step col, y + step row)."""
+
+    f_px: float
+    principal_px: tuple[float, float]
+    baseline_mm: tuple[float, float]
+    shift_px: tuple[float, float]
+    x: int
+    y: int
+    step: int
+    rows: int
+    cols: int
+    pitch: int
+
+
+class EstimateStage:
+    """Maps of ``Output`` planes [rows, pitch] from the packed tensor of ``TensorStage``."""
+
+    def __init__(self, device: Device, problem: Problem, layout: TensorLayout, view: View):
+        from leafflow_ti.kernels.workspace import Layout, Number, Region, Value
+
+        self.device, self.problem, self.view = device, problem, view
+        columns = problem.columns
+        rows = self._rows()
+        self.layout = Layout(
+            columns.n, columns.n_time_like, len(rows.camera[0]) if rows.camera else 0, len(rows.motion),
+            len(problem.terms), 2 * len(problem.offsets) + problem.use_range, problem.solver == "jacobi",
+        )  # fmt: skip
+        flow = columns.n_flow
+        self.numbers = np.full(Number.LOWER + len(layout.lower), -1, np.int32)
+        self.numbers[: len(Region)] = self.layout.offsets
+        self.values = np.zeros(Value.RATIO + columns.n_time_like * flow * (flow + 1) // 2)
+        self._fill_model(rows, layout)
+        self._fill_view(view)
+        lanes = device.dense.lanes
+        n_pixels = view.rows * view.pitch
+        itemsize = np.dtype(device.real("algebra")).itemsize
+        per_group = self.layout.n_elements * lanes * itemsize
+        self._groups = max(1, min(n_pixels // lanes, BATCH_BYTES // per_group if not device.gpu else 1 << 15))
+        self._workspace = device.empty(self._groups * self.layout.n_elements * lanes, "algebra")
+        from leafflow_ti.kernels.maps import Output
+
+        self._maps = device.empty(Output.PLANES * n_pixels)
+
+    def _rows(self) -> SimpleNamespace:
+        """Columns of the motion rows and of each camera solution's geometry rows; a brightness row stands last."""
+        problem, columns = self.problem, self.problem.columns
+        last = [i for i in [columns.index("i")] if i is not None]
+
+        def both(own: str, offsets: Sequence[str]) -> list[int]:
+            other = "y" if own == "x" else "x"
+            found = [columns.index(c, o) for c in (own, other) for o in offsets]
+            return [i for i in found if i is not None] + last
+
+        motion = both("x", problem.offsets) if "t" in columns.solutions else []
+        return SimpleNamespace(
+            motion=motion, camera=[both("x" if a == "sx" else "y", problem.terms) for a in problem.camera_axes]
+        )
+
+    def _fill_model(self, rows: SimpleNamespace, layout: TensorLayout) -> None:
+        from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Value
+
+        problem, columns, sampling = self.problem, self.problem.columns, self.problem.sampling
+        number, value = self.numbers, self.values
+        precision = self.device.algebra
+        number[Number.N], number[Number.SOLUTIONS], number[Number.FLOW] = columns.n, columns.n_time_like, columns.n_flow
+        number[Number.WITH_FULL] = problem.solver == "jacobi"
+        number[Number.ITERATIONS] = problem.iterations
+        has_time = "t" in columns.solutions
+        number[Number.MOTION_SOLUTION] = columns.n_time_like - 1 if has_time else -1
+        number[Number.TERMS] = len(problem.terms)
+        number[Number.OFFSETS] = len(problem.offsets)
+        number[Number.ROWS_T] = len(rows.motion)
+        number[Number.ROWS_S] = len(rows.camera[0]) if rows.camera else 0
+        number[Number.USE_RANGE] = problem.use_range
+        number[Number.UNKNOWNS] = problem.unknowns
+        number[Number.WEIGHTED] = problem.weighted
+        number[Number.PASSES] = problem.passes
+        brightness = columns.index("i")
+        number[Number.BRIGHTNESS_COLUMN] = -1 if brightness is None else brightness
+        number[Number.RANGE_TERM] = problem.terms.index("t") if "t" in problem.terms else -1
+        number[Number.CAMERA_SOLUTIONS] = len(problem.camera_axes)
+        number[Number.EXTRA] = len(layout.entries)
+        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = columns.index("x"), columns.index("y")
+        for i, o in enumerate(problem.offsets):
+            number[Number.OFFSET_CODES + i] = 0 if o == "1" else 1 + AXES.index(o)
+        number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows.motion)] = rows.motion
+        number[Number.LOWER :] = layout.lower
+        noise = column_noise(sampling, columns)
+        value[Value.RIDGE], value[Value.GAP], value[Value.STEP_SIZE] = (t[precision] for t in (RIDGE, GAP, STEP_SIZE))
+        value[Value.SCALE : Value.SCALE + columns.n] = noise**-0.5
+        value[Value.NOISE : Value.NOISE + columns.n] = noise
+        value[Value.GAIN] = noise_gain(sampling, "x")
+        value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
+        lower = np.tril_indices(columns.n_flow)
+        ratios = [noise_ratio(sampling, columns, a)[lower] for a in columns.solutions]
+        value[Value.RATIO :] = np.concatenate(ratios)
+        number[Number.CROSS_TERMS] = 0
+        for k, axis in enumerate(problem.camera_axes):
+            number[Number.CAMERA_AXIS + k] = 0 if axis == "sx" else 1
+            at = Number.CAMERA_ROWS + k * MAX_ROWS
+            number[at : at + len(rows.camera[k])] = rows.camera[k]
+            terms = cross_noise(sampling, columns, axis, "t") if has_time else ()
+            number[Number.CROSS_TERMS] = len(terms)
+            for j, term in enumerate(terms):
+                r, c = max(term.base_a, term.base_b), min(term.base_a, term.base_b)
+                at = Number.CROSS_AB + (k * 9 + j) * 3
+                number[at : at + 3] = term.a, term.b, layout.lower[r * (r + 1) // 2 + c]
+                value[Value.CROSS + k * 9 + j] = term.value
+
+    def _fill_view(self, view: View) -> None:
+        from leafflow_ti.kernels.workspace import Number, Value
+
+        self.numbers[Number.OUT_X], self.numbers[Number.OUT_Y] = view.x, view.y
+        self.numbers[Number.STEP], self.numbers[Number.PITCH] = view.step, view.pitch
+        self.values[Value.F], self.values[Value.PX], self.values[Value.PY] = view.f_px, *view.principal_px
+        self.values[Value.BASELINE : Value.BASELINE + 2] = view.baseline_mm
+        self.values[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
+        self._number = self.device.array(self.numbers, "int")
+        self._value = self.device.array(self.values, "algebra")
+
+    def unscaled(self) -> Any:
+        """The table ``value`` with unit scales: the tensor in raw units."""
+        from leafflow_ti.kernels.workspace import MAX_COLUMNS, Value
+
+        raw = self.values.copy()
+        raw[Value.SCALE : Value.SCALE + MAX_COLUMNS] = 1.0
+        return self.device.array(raw, "algebra")
+
+    def __call__(self, tensor: Any) -> NDArray[Any]:
+        """The planes of ``Output`` as a NumPy array [planes, rows, cols]."""
+        from leafflow_ti.kernels.covariance import covariance_kernels
+        from leafflow_ti.kernels.maps import Output, maps_kernel
+        from leafflow_ti.kernels.patch_fit import patch_fit_kernel
+
+        device, view, problem = self.device, self.view, self.problem
+        lanes = device.dense.lanes
+        n_pixels = view.rows * view.pitch
+        solve = ESTIMATORS[problem.estimator](self)
+        covariance = covariance_kernels(device.dense)
+        for first in range(0, n_pixels // lanes, self._groups):
+            groups = min(self._groups, n_pixels // lanes - first)
+            step, stride = (self.layout.n_elements * lanes, lanes) if not device.gpu else (1, groups)
+
+            def launch(kernel: Any, value: Any = None, *, at: Any = (first, groups, step, stride)) -> None:
+                first, groups, step, stride = at
+                kernel(
+                    first * lanes, n_pixels, groups, step, stride, device.tasks(groups), self._number,
+                    self._value if value is None else value, tensor, self._workspace, self._maps,
+                )  # fmt: skip
+
+            solve(launch)
+            if "t" in problem.columns.solutions:
+                launch(covariance.motion_covariance)
+            if problem.camera_axes:
+                launch(covariance.geometry)
+            if problem.unknowns:
+                launch(patch_fit_kernel(device.dense))
+            launch(maps_kernel(device.dense))
+        planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)
+        result: NDArray[Any] = planes[:, :, : view.cols]
+        return result

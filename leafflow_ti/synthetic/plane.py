@@ -1,0 +1,173 @@
+"""A textured, rigidly moving plane, rendered by exact ray/plane intersection (Schuchert 2010, App. B).
+
+The texture, fixed to the material, is
+
+    I = (o + a cos(2π xP/λ1) cos(2π yP/λ2)) exp(h)
+    xP =  cos α p + sin α q,   yP = -sin β p + cos β q                   p, q: in-plane coordinates from the centre
+
+with ``p, q`` along the axes of the smallest rotation that turns (0, 0, 1) into the normal; α = β turns an orthogonal
+pattern in its plane, α ≠ β shears it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from leafflow_ti.errors import UsageError
+from leafflow_ti.synthetic.geometry import Array, plane_axes
+from leafflow_ti.synthetic.motion import RigidScene
+from leafflow_ti.synthetic.rig import Vector, render_grid
+
+
+@dataclass(frozen=True)
+class BrightnessTerm:
+    """One term ``(g + gx ΔX + gy ΔY) m^power`` of ``h`` (Schuchert 2010, Eqs. (4.15), (4.27), section 6.1).
+
+    ``m`` is ``t`` [frames] or the camera position ``sx``, ``sy`` [mm]; (ΔX, ΔY) [mm] is where the material point lies
+    at t = 0, relative to the patch centre. ``g`` is in 1/m^power, ``gx``, ``gy`` per mm of that.
+    """
+
+    axis: Literal["t", "sx", "sy"]
+    power: int
+    g: float
+    gx: float = 0.0
+    gy: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.axis not in ("t", "sx", "sy"):
+            raise UsageError(f"brightness axis '{self.axis}': choose t, sx or sy")
+        if self.power < 1:
+            raise UsageError(f"brightness power {self.power}: at least 1 (a constant factor belongs to the texture)")
+        if not np.isfinite((self.g, self.gx, self.gy)).all():
+            raise UsageError(f"brightness coefficients {self.g}, {self.gx}, {self.gy}: all must be finite")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneScene(RigidScene):
+    """The plane ``Z = Z0 + ZX (X - X0) + ZY (Y - Y0)`` and its texture; motion and cameras are inherited.
+
+    ``alpha``, ``beta`` in rad (``beta`` None: equal to ``alpha``), ``offset`` and ``amplitude`` in grey values.
+    Raises UsageError for values that make no sense.
+    """
+
+    centre: Vector = (0.0, 0.0, 100.0)
+    zx: float = 0.0
+    zy: float = 0.0
+    offset: float = 100.0
+    amplitude: float = 50.0
+    wavelengths_mm: tuple[float, float] = (0.3, 0.3)
+    alpha: float = 0.0
+    beta: float | None = None
+    brightness: tuple[BrightnessTerm, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.wavelengths_mm) <= 0.0:
+            raise UsageError(f"wavelengths {self.wavelengths_mm} mm: both must be positive")
+
+    def intersect(self, rays: Array, camera: Array, t: float) -> Array:
+        """World points [..., 3] where rays [..., 3] from ``camera`` [3 or ..., 3] meet the plane at time ``t``.
+
+        Raises UsageError where a ray misses the front of the plane.
+        """
+        rotation, shift = self.pose(t)
+        normal = rotation @ plane_axes(self.zx, self.zy)[:, 2]
+        distance = (rotation @ np.array(self.centre) + shift - camera) @ normal
+        slant = rays @ normal
+        if np.min(distance) <= 0.0 or np.min(slant) <= 0.0:
+            raise UsageError(
+                f"at t = {t:g} frames the plane is seen edge-on or from behind: "
+                "reduce its slopes or its motion, or make the images smaller"
+            )
+        return np.asarray(camera + (distance / slant)[..., None] * rays)
+
+    def material(self, points: Array, t: float) -> Array:
+        """Where the material points now at ``points`` [..., 3] were at t = 0, relative to the patch centre [mm]."""
+        rotation, shift = self.pose(t)
+        return np.asarray((points - shift) @ rotation - np.array(self.centre))
+
+    def texture(self, offsets: Array) -> Array:
+        """Grey values [...] of the material points ``offsets`` [..., 3], without brightness changes."""
+        pq = offsets @ plane_axes(self.zx, self.zy)
+        beta = self.alpha if self.beta is None else self.beta
+        first = math.cos(self.alpha) * pq[..., 0] + math.sin(self.alpha) * pq[..., 1]
+        second = math.cos(beta) * pq[..., 1] - math.sin(beta) * pq[..., 0]
+        k1, k2 = (2.0 * math.pi / wavelength for wavelength in self.wavelengths_mm)
+        return np.asarray(self.offset + self.amplitude * np.cos(k1 * first) * np.cos(k2 * second))
+
+    def log_brightness(self, offsets: Array, camera: Array, t: float) -> Array:
+        """The exponent ``h`` [...] at the material points ``offsets`` [..., 3]."""
+        h = np.zeros(offsets.shape[:-1])
+        where = {"t": t, "sx": float(camera[0]), "sy": float(camera[1])}
+        for term in self.brightness:
+            h += (term.g + term.gx * offsets[..., 0] + term.gy * offsets[..., 1]) * where[term.axis] ** term.power
+        return h
+
+
+def render_image(scene: PlaneScene, frame: int, row: int, col: int) -> Array:
+    """One image [H, W] of the camera (row, col) at ``frame``; float64 grey values, exposed (noise, bit depth)."""
+    camera, t = scene.camera_position(row, col), scene.time(frame)
+    offsets = scene.material(scene.intersect(scene.rays(), camera, t), t)
+    image = scene.texture(offsets)
+    if scene.brightness:
+        image = image * np.exp(scene.log_brightness(offsets, camera, t))
+    return scene.expose(image, frame, row, col)
+
+
+def render(
+    scene: PlaneScene,
+    frames: Iterable[int] | None = None,
+    cameras: tuple[Iterable[int], Iterable[int]] | None = None,
+) -> Array:
+    """Images, float64 [t, sy, sx, y, x]; ``frames`` and ``cameras`` (rows, columns) choose a part.
+
+    Raises UsageError if the plane turns away from a camera, or for an index that does not exist.
+    """
+    return render_grid(scene, partial(render_image, scene), frames, cameras)
+
+
+def truth(scene: PlaneScene) -> dict[str, Array]:
+    """What the middle camera sees at the middle frame.
+
+    ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] = N + Ω × (X - Xr) mm/frame, of the point seen at the
+    pixel; ``omega`` [3] rad/frame; ``acceleration`` [H, W, 3] = A + Ω × (Ω × (X - Xr)) mm/frame².
+    """
+    points = scene.intersect(scene.rays(), np.zeros(3), 0.0)
+    velocity, acceleration = scene.point_motion(points)
+    return {
+        "depth": points[..., 2],
+        "zx": np.full(points.shape[:2], scene.zx),
+        "zy": np.full(points.shape[:2], scene.zy),
+        "velocity": velocity,
+        "omega": np.array(scene.omega),
+        "acceleration": acceleration,
+    }
+
+
+def sinusoid_scene(noise: float = 0.0, size: tuple[int, int] = (161, 161), bits: int | None = None) -> PlaneScene:
+    """The sinusoid of Schuchert 2010, section 5.3, with the patch centre on the optical axis.
+
+    f = 12 mm at 4.4 µm pixel pitch (2727.27 px), 9 cameras 0.5 mm apart (disparity -13.6 px per step at the centre),
+    9 frames. Grey values 100 ± 50, so that ``noise`` 2.5 is 2.5 % of the grey range of 100.
+    """
+    axis = np.array([2.0, 3.0, 2.0])
+    ox, oy, oz = (math.radians(0.003) * axis / np.linalg.norm(axis)).tolist()
+    return PlaneScene(
+        f_px=12.0 / 0.0044,
+        baseline_mm=(0.5, 0.5),
+        size=size,
+        noise=noise,
+        bits=bits,
+        centre=(0.0, 0.0, 100.0),
+        zx=0.6,
+        zy=-0.5,
+        velocity=(0.0073, -0.0037, 0.06),
+        omega=(ox, oy, oz),
+        wavelengths_mm=(0.3, 0.3),
+    )
