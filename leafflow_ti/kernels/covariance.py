@@ -48,8 +48,7 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                 at = response_at + (r * n_rows + c) * stride
                 for i in range(lanes):
                     ws[at + i] = unit
-        small.solve_lower(ws, factor, response_at, flow, n_rows, stride)
-        small.solve_upper(ws, factor, response_at, flow, n_rows, stride)
+        small.solve(ws, factor, response_at, flow, n_rows, stride)
         table = Value.RATIO + solution * (flow * (flow + 1) // 2)
         for r in range(flow):
             for c in range(r + 1):
@@ -138,8 +137,7 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                     ws[at + i] = unit
         if number[Number.WEIGHTED] == 1:
             small.cholesky(ws, cov, n_used, stride)
-            small.solve_lower(ws, cov, work, n_used, terms, stride)
-            small.solve_upper(ws, cov, work, n_used, terms, stride)
+            small.solve(ws, cov, work, n_used, terms, stride)
         else:
             spread = base + number[Region.GEOMETRY_SPREAD] * stride
             for r in range(terms):
@@ -213,19 +211,14 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
         cov = base + number[Region.GEOMETRY_COV] * stride
         small.cholesky(ws, normal, terms, stride)
         small.copy(ws, rhs, result, terms, stride)
-        small.solve_lower(ws, normal, result, terms, 1, stride)
-        small.solve_upper(ws, normal, result, terms, 1, stride)
-        small.solve_lower(ws, normal, cross, terms, rows_t, stride)
-        small.solve_upper(ws, normal, cross, terms, rows_t, stride)
+        for part in range(2):
+            target = ti.select(part == 0, result, cross)
+            small.solve(ws, normal, target, terms, ti.select(part == 0, 1, rows_t), stride)
         if number[Number.WEIGHTED] == 1:
             small.set_identity(ws, cov, terms, stride)
         else:
             small.unpack(ws, base + number[Region.GEOMETRY_SPREAD] * stride, cov, terms, stride)
-            small.solve_lower(ws, normal, cov, terms, terms, stride)
-            small.solve_upper(ws, normal, cov, terms, terms, stride)
-            small.transpose(ws, cov, terms, stride)
-        small.solve_lower(ws, normal, cov, terms, terms, stride)
-        small.solve_upper(ws, normal, cov, terms, terms, stride)
+        small.sandwich(ws, normal, cov, terms, 2 - number[Number.WEIGHTED], stride)
 
     @ti.func
     def brightness_std(base: ti.i32, stride: ti.i32, camera: ti.i32, number: ti.template(), ws: ti.template()):

@@ -50,45 +50,39 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                         ws[at + i] = total[i] * inverse[i]
 
     @ti.func
-    def solve_lower(ws: ti.template(), l: ti.i32, x: ti.i32, n: ti.i32, m: ti.i32, stride: ti.i32):
-        """``X := L^-1 X`` for the factor at ``l`` and X [n, m] at ``x``."""
-        for r in range(n):
-            for c in range(m):
-                total = ti.Vector.zero(precise, lanes)
-                at = x + (r * m + c) * stride
-                for i in range(lanes):
-                    total[i] = ws[at + i]
-                for k in range(r):
-                    one = l + tri(r, k) * stride
-                    two = x + (k * m + c) * stride
-                    for i in range(lanes):
-                        total[i] -= ws[one + i] * ws[two + i]
+    def solve(ws: ti.template(), l: ti.i32, x: ti.i32, n: ti.i32, m: ti.i32, stride: ti.i32):
+        """``X := (L L^T)^-1 X`` for the factor at ``l`` and X [n, m] at ``x``.
+
+        Forward and backward substitution are one loop over both directions: inlined code is compiled once per call.
+        """
+        for backward in range(2):
+            for step in range(n):
+                r = ti.select(backward == 1, n - 1 - step, step)
+                first = ti.select(backward == 1, r + 1, 0)
                 diagonal = l + tri(r, r) * stride
-                for i in range(lanes):
-                    total[i] *= ws[diagonal + i]
-                for i in range(lanes):
-                    ws[at + i] = total[i]
+                for c in range(m):
+                    total = ti.Vector.zero(precise, lanes)
+                    at = x + (r * m + c) * stride
+                    for i in range(lanes):
+                        total[i] = ws[at + i]
+                    for k in range(first, first + step):
+                        one = l + tri(ti.max(r, k), ti.min(r, k)) * stride
+                        two = x + (k * m + c) * stride
+                        for i in range(lanes):
+                            total[i] -= ws[one + i] * ws[two + i]
+                    for i in range(lanes):
+                        total[i] *= ws[diagonal + i]
+                    store(ws, at, total)
 
     @ti.func
-    def solve_upper(ws: ti.template(), l: ti.i32, x: ti.i32, n: ti.i32, m: ti.i32, stride: ti.i32):
-        """``X := L^-T X`` for the factor at ``l`` and X [n, m] at ``x``."""
-        for back in range(n):
-            r = n - 1 - back
-            for c in range(m):
-                total = ti.Vector.zero(precise, lanes)
-                at = x + (r * m + c) * stride
-                for i in range(lanes):
-                    total[i] = ws[at + i]
-                for k in range(r + 1, n):
-                    one = l + tri(k, r) * stride
-                    two = x + (k * m + c) * stride
-                    for i in range(lanes):
-                        total[i] -= ws[one + i] * ws[two + i]
-                diagonal = l + tri(r, r) * stride
-                for i in range(lanes):
-                    total[i] *= ws[diagonal + i]
-                for i in range(lanes):
-                    ws[at + i] = total[i]
+    def sandwich(ws: ti.template(), l: ti.i32, x: ti.i32, n: ti.i32, times: ti.i32, stride: ti.i32):
+        """``X := M^-1 X`` once, or ``M^-1 X M^-1`` with ``times`` = 2, for symmetric X [n, n] and the factor of M."""
+        always = ti.Vector.one(ti.i32, lanes)
+        for _ in range(times):
+            solve(ws, l, x, n, n, stride)
+            for r in range(n):
+                for c in range(r):
+                    exchange(ws, x + (r * n + c) * stride, x + (c * n + r) * stride, always)
 
     @ti.func
     def upper_times(ws: ti.template(), l: ti.i32, x: ti.i32, y: ti.i32, n: ti.i32, m: ti.i32, stride: ti.i32):
@@ -153,23 +147,15 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                 copy(ws, a + tri(ti.max(r, c), ti.min(r, c)) * stride, x + (r * n + c) * stride, 1, stride)
 
     @ti.func
-    def transpose(ws: ti.template(), x: ti.i32, n: ti.i32, stride: ti.i32):
-        """``X := X^T`` for X [n, n]."""
-        always = ti.Vector.one(ti.i32, lanes)
-        for r in range(n):
-            for c in range(r):
-                exchange(ws, x + (r * n + c) * stride, x + (c * n + r) * stride, always)
-
-    @ti.func
-    def jacobi(ws: ti.template(), a: ti.i32, v: ti.i32, n: ti.i32, sweeps: ti.i32, stride: ti.i32):
-        """Cyclic Jacobi: diagonalises the full matrix [n, n] at ``a`` in place, eigenvectors in the columns of V at ``v``.
+    def jacobi(ws: ti.template(), a: ti.i32, n: ti.i32, sweeps: ti.i32, stride: ti.i32):
+        """Cyclic Jacobi: diagonalises the full matrix [n, n] at ``a``; the columns of V, right behind it, are the vectors.
 
         A lane whose off-diagonal element is negligible rotates by nothing, so a lane's result does not depend on its
         neighbours, however many sweeps they need.
         """
         for r in range(n):
             for c in range(n):
-                at = v + (r * n + c) * stride
+                at = a + ((n + r) * n + c) * stride
                 unit = ti.cast(r == c, precise)
                 for i in range(lanes):
                     ws[at + i] = unit
@@ -197,11 +183,11 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                             sine[i] = t * cosine[i]
                         for i in range(lanes):
                             active |= turned[i]
-                        for k in range(n):
-                            rotate(ws, a + (k * n + p) * stride, a + (k * n + q) * stride, cosine, sine)
-                            rotate(ws, v + (k * n + p) * stride, v + (k * n + q) * stride, cosine, sine)
-                        for k in range(n):
-                            rotate(ws, a + (p * n + k) * stride, a + (q * n + k) * stride, cosine, sine)
+                        for k in range(3 * n):
+                            # Columns of A and of V, which lies behind it, then rows of A.
+                            one = ti.select(k < 2 * n, k * n + p, p * n + k - 2 * n)
+                            two = ti.select(k < 2 * n, k * n + q, q * n + k - 2 * n)
+                            rotate(ws, a + one * stride, a + two * stride, cosine, sine)
 
     negligible = 1e-32 if spec.algebra == "f64" else 1e-15
 
@@ -216,8 +202,8 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         store(ws, two, second)
 
     @ti.func
-    def sort_eigen(ws: ti.template(), a: ti.i32, v: ti.i32, n: ti.i32, k: ti.i32, stride: ti.i32):
-        """Bring the k + 1 smallest diagonal elements of [n, n] at ``a``, with their columns of V, to the front."""
+    def sort_eigen(ws: ti.template(), a: ti.i32, n: ti.i32, k: ti.i32, stride: ti.i32):
+        """Bring the k + 1 smallest diagonal elements of [n, n] at ``a``, with the columns of V behind it, to the front."""
         for j in range(ti.min(k + 1, n)):
             for m in range(j + 1, n):
                 swap = ti.Vector.zero(ti.i32, lanes)
@@ -225,9 +211,11 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                 two = a + (m * n + m) * stride
                 for i in range(lanes):
                     swap[i] = ti.cast(ws[two + i] < ws[one + i], ti.i32)
-                exchange(ws, one, two, swap)
-                for r in range(n):
-                    exchange(ws, v + (r * n + j) * stride, v + (r * n + m) * stride, swap)
+                for r in range(n + 1):
+                    # The diagonal elements themselves, then the rows of V.
+                    left = ti.select(r == n, one, a + ((n + r) * n + j) * stride)
+                    right = ti.select(r == n, two, a + ((n + r) * n + m) * stride)
+                    exchange(ws, left, right, swap)
 
     @ti.func
     def exchange(ws: ti.template(), one: ti.i32, two: ti.i32, swap: ti.template()):
@@ -244,13 +232,13 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         """``X := X Q`` for X [n, m] and Q [m, m]; ``m`` is a compile-time number."""
         for r in range(n):
             row = ti.Matrix.zero(precise, m, lanes)
-            for c in ti.static(range(m)):
-                for k in ti.static(range(m)):
+            for c in range(m):
+                for k in range(m):
                     one = x + (r * m + k) * stride
                     two = q + (k * m + c) * stride
                     for i in range(lanes):
                         row[c, i] += ws[one + i] * ws[two + i]
-            for c in ti.static(range(m)):
+            for c in range(m):
                 at = x + (r * m + c) * stride
                 for i in range(lanes):
                     ws[at + i] = row[c, i]
@@ -259,12 +247,11 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         copy=copy,
         set_identity=set_identity,
         unpack=unpack,
-        transpose=transpose,
+        sandwich=sandwich,
         sort_eigen=sort_eigen,
         times_small=times_small,
         cholesky=cholesky,
-        solve_lower=solve_lower,
-        solve_upper=solve_upper,
+        solve=solve,
         upper_times=upper_times,
         dot=dot,
         store=store,

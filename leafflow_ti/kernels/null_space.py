@@ -121,8 +121,7 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
         ritz = base + number[Region.RITZ] * stride
         turn = base + number[Region.RITZ_VECTORS] * stride
         for _ in range(number[Number.ITERATIONS]):
-            small.solve_lower(ws, factor, vectors, n, BLOCK, stride)
-            small.solve_upper(ws, factor, vectors, n, BLOCK, stride)
+            small.solve(ws, factor, vectors, n, BLOCK, stride)
             for j in range(BLOCK):
                 for m in range(j):
                     overlap = small.dot(ws, vectors + m * stride, BLOCK, vectors + j * stride, BLOCK, n, stride)
@@ -147,10 +146,9 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
             for m in range(BLOCK):
                 product = small.dot(ws, images + j * stride, BLOCK, images + m * stride, BLOCK, n, stride)
                 small.store(ws, ritz + (j * BLOCK + m) * stride, product)
-        small.jacobi(ws, ritz, turn, BLOCK, RITZ_SWEEPS, stride)
-        small.sort_eigen(ws, ritz, turn, BLOCK, k, stride)
-        small.times_small(ws, vectors, turn, n, BLOCK, stride)
-        small.times_small(ws, images, turn, n, BLOCK, stride)
+        small.jacobi(ws, ritz, BLOCK, RITZ_SWEEPS, stride)
+        small.sort_eigen(ws, ritz, BLOCK, k, stride)
+        small.times_small(ws, vectors, turn, 2 * n, BLOCK, stride)  # and the images, which lie behind
         # A v = L (L^T v); its distance from θ v, against the gap to the next Ritz value, bounds the angle left.
         error = ti.Vector.zero(precise, lanes)
         for j in range(k):
@@ -187,8 +185,8 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
         full = base + number[Region.FULL] * stride
         turn = base + number[Region.FULL_VECTORS] * stride
         vectors = base + number[Region.VECTORS] * stride
-        small.jacobi(ws, full, turn, n, JACOBI_SWEEPS, stride)
-        small.sort_eigen(ws, full, turn, n, k, stride)
+        small.jacobi(ws, full, n, JACOBI_SWEEPS, stride)
+        small.sort_eigen(ws, full, n, k, stride)
         for j in range(k):
             for r in range(n):
                 at = turn + (r * n + j) * stride

@@ -85,11 +85,13 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         k: ti.i32, code: ti.i32, ray: ti.template(), s: ti.template(), N: ti.template(), value: ti.template()
     ):
         """The row as the preshifted data measure it, per camera step along s."""
-        f = value[Value.F]
-        row = bare_row(k, code, ray, f, s, N)
-        if code == 3 or code == 4:
-            axis = code - 3
-            row = value[Value.BASELINE + axis] * row + value[Value.SHIFT + axis] * bare_row(k, axis + 1, ray, f, s, N)
+        along_s = code == 3 or code == 4
+        row = vec9(0)
+        for part in range(ti.select(along_s, 2, 1)):
+            factor = precise(1.0)
+            if along_s:
+                factor = value[ti.select(part == 0, Value.BASELINE, Value.SHIFT) + code - 3]
+            row += factor * bare_row(k, ti.select(part == 0, code, code - 2), ray, value[Value.F], s, N)
         return row
 
     @ti.func
@@ -179,15 +181,15 @@ def patch_fit_kernel(spec: KernelSpec):
                 elif term == 2:
                     h /= value[Value.F]
                     up[2] = h
-                plus = patch.surface(ray, value[Value.F], nu + up[0], b[0] + up[1], b[1] + up[2])
-                minus = patch.surface(ray, value[Value.F], nu - up[0], b[0] - up[1], b[1] - up[2])
                 for r in range(n_rows):
-                    change = precise(0.0)
+                    change = ti.cast(r == 2 * number[Number.OFFSETS] and term == number[Number.RANGE_TERM], precise)
                     if term < 3:
-                        difference = any_row(r, ray, plus, N, number, value) - any_row(r, ray, minus, N, number, value)
-                        change = -difference.dot(motion) / (2 * h)
-                    if r == 2 * number[Number.OFFSETS] and term == number[Number.RANGE_TERM]:
-                        change += precise(1.0)
+                        for side in range(2):
+                            sign = ti.select(side == 0, precise(1.0), precise(-1.0))
+                            s = patch.surface(
+                                ray, value[Value.F], nu + sign * up[0], b[0] + sign * up[1], b[1] + sign * up[2]
+                            )
+                            change -= sign * any_row(r, ray, s, N, number, value).dot(motion) / (2 * h)
                     ws[target + (r * terms + term) * stride + i] = change
 
     @ti.func
@@ -250,16 +252,14 @@ def patch_fit_kernel(spec: KernelSpec):
         if number[Number.WEIGHTED] == 1:
             small.copy(ws, base + number[Region.SPREAD] * stride, factor, n_rows * (n_rows + 1) // 2, stride)
             small.cholesky(ws, factor, n_rows, stride)
-            small.solve_lower(ws, factor, weighted, n_rows, n, stride)
-            small.solve_upper(ws, factor, weighted, n_rows, n, stride)
+            small.solve(ws, factor, weighted, n_rows, n, stride)
         for r in range(n):
             for c in range(r + 1):
                 element = small.dot(ws, a + r * stride, MAX_UNKNOWNS, weighted + c * stride, n, n_rows, stride)
                 small.store(ws, normal + tri(r, c) * stride, element)
             small.store(ws, q + r * stride, small.dot(ws, weighted + r * stride, n, v, 1, n_rows, stride))
         small.cholesky(ws, normal, n, stride)
-        small.solve_lower(ws, normal, q, n, 1, stride)
-        small.solve_upper(ws, normal, q, n, 1, stride)
+        small.solve(ws, normal, q, n, 1, stride)
 
     @ti.func
     def patch_fit(
@@ -297,10 +297,6 @@ def patch_fit_kernel(spec: KernelSpec):
             for c in range(n):
                 element = small.dot(ws, weighted + r * stride, n, work + c * stride, n, n_rows, stride)
                 small.store(ws, cov + (r * n + c) * stride, element)
-        small.solve_lower(ws, normal, cov, n, n, stride)
-        small.solve_upper(ws, normal, cov, n, n, stride)
-        small.transpose(ws, cov, n, stride)
-        small.solve_lower(ws, normal, cov, n, n, stride)
-        small.solve_upper(ws, normal, cov, n, n, stride)
+        small.sandwich(ws, normal, cov, n, 2, stride)
 
     return batch_kernel(spec, patch_fit)
