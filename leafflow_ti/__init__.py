@@ -1,3 +1,40 @@
-"""leafflow-ti: dense depth, surface normals and 3D motion of leaves from camera-grid image sequences."""
+"""leafflow-ti: dense depth, surface normals and 3D motion of leaves from camera-grid image sequences.
+
+    import leafflow_ti as lf
+    field = lf.estimate("capture.toml", model="affine-4d", window=65, stride=4)
+    field["depth"], field["depth_std"], field.status
+
+Importing the package starts no compute engine and loads no heavy module; the names below load theirs when first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from leafflow_ti.api import estimate, plan_run, run
+    from leafflow_ti.capture import Capture, Geometry, capture_from_array, open_capture
+    from leafflow_ti.config import RunConfig, load_config
+    from leafflow_ti.field import Field
+    from leafflow_ti.results import ResultStore
 
 __version__ = "0.1.0"
+
+_HOME = {
+    "estimate": "api", "plan_run": "api", "run": "api",
+    "Capture": "capture", "Geometry": "capture", "capture_from_array": "capture", "open_capture": "capture",
+    "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
+}  # fmt: skip
+__all__ = [
+    "Capture", "Field", "Geometry", "ResultStore", "RunConfig", "capture_from_array", "estimate", "load_config",
+    "open_capture", "plan_run", "run",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'leafflow_ti' has no attribute '{name}'")
+    return getattr(import_module(f"leafflow_ti.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

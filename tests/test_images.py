@@ -8,6 +8,7 @@ import logging
 import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import tifffile
 
 from leafflow_ti.capture.channels import MAX_PIXELS
 from leafflow_ti.capture.images import probe, read_gray, read_window
-from leafflow_ti.errors import InputError, MissingExtra
+from leafflow_ti.errors import InputError
 
 imagecodecs = pytest.importorskip("imagecodecs", reason="the codecs extra is not installed")
 Image = pytest.importorskip("PIL.Image", reason="Pillow, the independent writer, is not installed")
@@ -145,18 +146,28 @@ def test_declared_alpha_is_ignored_but_unnamed_samples_need_a_choice(tmp_path: P
         read_gray(path, channel="red")
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_orientation_is_applied(tmp_path: Path, orientation: int) -> None:
-    """Against Pillow, which applies the tag when it loads a TIFF, and windows against the whole."""
+@pytest.mark.parametrize(
+    ("orientation", "upright"),
+    [
+        (1, lambda image: image),
+        (2, np.fliplr),
+        (3, lambda image: np.rot90(image, 2)),
+        (4, np.flipud),
+        (5, np.transpose),
+        (6, lambda image: np.rot90(image, -1)),  # stored turned to the left: turn it clockwise
+        (7, lambda image: np.rot90(image, 2).T),
+        (8, lambda image: np.rot90(image, 1)),
+    ],
+)
+def test_orientation_is_applied(tmp_path: Path, orientation: int, upright: Callable[[np.ndarray], np.ndarray]) -> None:
     image = RNG.integers(0, 255, (5, 7), np.uint8)
+    expected = upright(image)
     path = tmp_path / "a.tif"
     _write_tiff(path, image.tobytes(), 7, 5, BitsPerSample=8, PhotometricInterpretation=1, Orientation=orientation)
-    with Image.open(path) as opened:
-        upright = np.asarray(opened)
     info = probe(path)
-    assert (info.height, info.width) == upright.shape
-    np.testing.assert_array_equal(read_gray(path), upright)
-    np.testing.assert_array_equal(read_window(path, 0, "luminance", 1, 4, 2, 5), upright[1:4, 2:5])
+    assert (info.height, info.width) == expected.shape
+    np.testing.assert_array_equal(read_gray(path), expected)
+    np.testing.assert_array_equal(read_window(path, 0, "luminance", 1, 4, 2, 5), expected[1:4, 2:5])
 
 
 @pytest.mark.parametrize("bits", [4, 8])
@@ -202,7 +213,7 @@ def test_stacks_page_by_page(tmp_path: Path, kind: str) -> None:
     elif kind == "imagej-hyperstack":
         tifffile.imwrite(path, stack, imagej=True, metadata={"axes": "TZYX"})
     else:
-        options = {"shaped": {}, "truncated": {"metadata": {"truncated": True}, "compression": None}}
+        options = {"shaped": {}, "truncated": {"truncate": True}}
         extra = {"ome": {"ome": True, "metadata": {"axes": "TZYX"}}, "bigtiff": {"bigtiff": True}}
         tifffile.imwrite(path, stack, photometric="minisblack", **{**options, **extra}[kind])
     info = probe(path)
@@ -289,7 +300,7 @@ def test_truncated_files_are_errors_never_zeros(tmp_path: Path, name: str) -> No
 def test_damaged_bytes_never_escape_as_other_errors(tmp_path: Path) -> None:
     """Whatever single byte is wrong: values of the stated size, or an InputError; nothing else, and no hang."""
     image = RNG.integers(0, 255, (16, 16), np.uint8)
-    outcomes = []
+    readable, refusals = 0, []
     for compression in (None, "zlib", "lzw"):
         path = tmp_path / f"{compression}.tif"
         tifffile.imwrite(path, image, compression=compression, metadata=None)
@@ -297,10 +308,12 @@ def test_damaged_bytes_never_escape_as_other_errors(tmp_path: Path) -> None:
         for position, value in itertools.product(range(4, min(len(content), 300), 3), (0, 255)):
             path.write_bytes(content[:position] + bytes([value]) + content[position + 1 :])
             try:
-                outcomes.append(read_gray(path).ndim == 2)
+                readable += read_gray(path).ndim == 2
             except InputError as error:
-                outcomes.append(path.name not in str(error))
-    assert {True, False} == set(outcomes)
+                refusals.append(str(error))
+    assert readable > 0
+    assert len(refusals) > 0
+    assert all(str(tmp_path) in line and "\n" not in line for line in refusals)
 
 
 def test_strips_that_decode_short_are_errors(tmp_path: Path) -> None:
@@ -326,14 +339,16 @@ def test_hostile_sizes_are_refused_before_memory_is_asked_for(tmp_path: Path) ->
             probe(tmp_path / name)
 
 
-def test_pages_that_form_a_circle_end(tmp_path: Path) -> None:
+def test_pages_that_form_a_circle_or_leave_the_file_are_errors(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     image = RNG.integers(0, 255, (8, 8), np.uint8)
     _write_tiff(path, image.tobytes(), 8, 8, BitsPerSample=8, PhotometricInterpretation=1)
     content = path.read_bytes()
-    path.write_bytes(content[:-4] + content[4:8])  # the next header is the first again
     assert probe(path).pages == 1
-    np.testing.assert_array_equal(read_gray(path), image)
+    for following in (content[4:8], struct.pack("<I", 10**6)):
+        path.write_bytes(content[:-4] + following)
+        with pytest.raises(InputError, match="page 1 has its header at byte"):
+            probe(path)
 
 
 @pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
@@ -458,4 +473,3 @@ def test_without_imagecodecs_the_extra_is_named(tmp_path: Path) -> None:
     assert lines[0] == str(int(image.sum()))
     assert [line.split()[1] for line in lines[1:]] == ["zstd.tif", "a.png", "packed.tif"]
     assert all("pip install 'leafflow-ti[codecs]'" in line for line in lines[1:])
-    assert issubclass(MissingExtra, Exception)

@@ -30,7 +30,7 @@ def read(path: Path, page: int, y0: int, y1: int, x0: int, x1: int, samples: tup
     except LeafflowError:
         raise
     except Exception as error:
-        if "imagecodecs" in str(error) and not _has_imagecodecs():
+        if (isinstance(error, ImportError) or "imagecodecs" in str(error)) and not _has_imagecodecs():
             raise MissingExtra("imagecodecs", "codecs", f"reading {path}") from error
         raise InputError(f"{path}: page {page} cannot be decoded ({one_line(error)}): write the file again") from error
     if source.inverted:

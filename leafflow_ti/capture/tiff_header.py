@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -77,6 +78,7 @@ Pages = tuple[TiffImage | InputError, ...]
 def _pages(path: Path, _size: int, _mtime_ns: int) -> tuple[Pages, tuple[int, ...]]:
     """All pages (a page that cannot be read stands as its error), and the sizes of the stack's axes."""
     try:
+        _check_chain(path, _size)
         with quiet(), tifffile.TiffFile(path) as tif:
             found = [page for page in tif.pages if isinstance(page, tifffile.TiffPage)]
             kept = [page for page in found if not page.subfiletype & 0b101] or found
@@ -91,6 +93,25 @@ def _pages(path: Path, _size: int, _mtime_ns: int) -> tuple[Pages, tuple[int, ..
     if count > len(pages):
         pages = _virtual_pages(path, pages[0], count, _size)
     return pages, shape
+
+
+def _check_chain(path: Path, size: int) -> None:
+    """Walk from header to header: a chain that leaves the file or bites its tail would lose pages or never end."""
+    with path.open("rb") as file:
+        head = file.read(16)
+        order = "<" if head[:2] == b"II" else ">"
+        big = head[2:4] in (b"+\0", b"\0+")
+        count_format, pointer_format, entry = (order + "Q", order + "Q", 20) if big else (order + "H", order + "I", 12)
+        (offset,) = struct.unpack_from(pointer_format, head, 8 if big else 4)
+        seen: set[int] = set()
+        while offset:
+            if offset in seen or offset >= size:
+                raise InputError(f"{path}: page {len(seen)} has its header at byte {offset}: damaged, write it again")
+            seen.add(offset)
+            file.seek(offset)
+            (entries,) = struct.unpack(count_format, file.read(struct.calcsize(count_format)))
+            file.seek(entries * entry, 1)
+            (offset,) = struct.unpack(pointer_format, file.read(struct.calcsize(pointer_format)))
 
 
 def _stack(tif: tifffile.TiffFile, kept: list[tifffile.TiffPage]) -> tuple[int, tuple[int, ...]]:

@@ -98,7 +98,7 @@ class EstimateStage:
         self.numbers[: len(Region)] = self.layout.offsets
         self.values = np.zeros(Value.RATIO + columns.n_time_like * flow * (flow + 1) // 2)
         self._fill_model(rows, layout)
-        self._fill_view(view)
+        self.set_view(view)
         lanes = device.dense.lanes
         n_pixels = view.rows * view.pitch
         itemsize = np.dtype(device.real("algebra")).itemsize
@@ -175,9 +175,11 @@ class EstimateStage:
                 number[at : at + 3] = term.a, term.b, layout.lower[r * (r + 1) // 2 + c]
                 value[Value.CROSS + k * 9 + j] = term.value
 
-    def _fill_view(self, view: View) -> None:
+    def set_view(self, view: View) -> None:
+        """Move to another band of the same size."""
         from leafflow_ti.kernels.workspace import Number, Value
 
+        self.view = view
         self.numbers[Number.OUT_X], self.numbers[Number.OUT_Y] = view.x, view.y
         self.numbers[Number.STEP], self.numbers[Number.PITCH] = view.step, view.pitch
         self.values[Value.F], self.values[Value.PX], self.values[Value.PY] = view.f_px, *view.principal_px

@@ -22,6 +22,7 @@ from leafflow_ti.sampling import Sampling
 
 EXTRA_PLANES = 3
 """Planes behind the tensor's entries: window mass, gradient energy, energy of the gradient smoothed once more."""
+OUTPUT_PLANES = 37
 _CAMERA = ("sy", "sx")
 _PASSES = ("t", "sy", "sx", "y", "x")
 _MASS, _ENERGY, _SMOOTH = ((name, (0, 0)) for name in ("mass", "energy", "smooth"))
@@ -68,6 +69,26 @@ class Terms:
         """From one list of terms per output plane."""
         first = np.cumsum([0] + [len(o) for o in outputs]).tolist()
         return cls(first, [s for o in outputs for s, _ in o], [w for o in outputs for _, w in o])
+
+
+def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int) -> int:
+    """Memory of the arrays of one band, from raw frames to output maps."""
+    cameras = (2 * sampling.sy.radius + 1) * (2 * sampling.sx.radius + 1)
+    taps = 2 * sampling.t.filter_radius + 1
+    channels = len(columns.channels)
+    samples = sampling.sx.size * sampling.sy.size
+    s, t = (AXES.index("sx"), AXES.index("sy")), AXES.index("t")
+    maps = {(e.channels, e.exponents[s[0]], e.exponents[s[1]]) for e in layout.entries}
+    sums = {(e.channels, e.exponents[s[0]], e.exponents[s[1]], e.exponents[t]) for e in layout.entries}
+    tall = {(e.channels, e.exponents[1:]) for e in layout.entries}
+    extra = EXTRA_PLANES
+    scratch = max(2 * cameras, 3 * samples * channels)
+    wide = taps * cameras + 2 * scratch + samples * channels + extra + sampling.t.size * (len(maps) + extra) + len(sums) + extra
+    pitch, out_pitch = round_up(band.in_cols, 64), round_up(band.cols, 64)
+    output = len(layout.entries) + extra + OUTPUT_PLANES
+    return itemsize * (
+        wide * band.in_rows * pitch + (len(tall) + extra) * band.rows * pitch + output * band.rows * out_pitch
+    )
 
 
 class Filtering:
@@ -117,6 +138,10 @@ class TensorStage:
         self._plan_products(layout)
         self._plan_windows(layout)
         self._raw = device.empty(self.n_taps * self._frame_size + self._slack)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames: the next one pushed starts a new window."""
         self._valid: deque[NDArray[np.bool_]] = deque(maxlen=self.n_taps)
         self._pushed = 0
         self._n_maps = 0

@@ -1,0 +1,158 @@
+"""The Python interface: a capture and options in, a ``Field`` or a results store out."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti import __version__
+from leafflow_ti.capture import Capture, open_capture
+from leafflow_ti.config import RunConfig, load_config
+from leafflow_ti.errors import RunError
+from leafflow_ti.field import Field, status_counts
+from leafflow_ti.pipeline import Maps, Pipeline
+from leafflow_ti.plan import Plan, Unit, make_plan
+from leafflow_ti.progress import Progress, RunSummary
+from leafflow_ti.results import ResultStore
+from leafflow_ti.runtime import Device, start
+
+
+def plan_run(capture: Capture, config: RunConfig) -> Plan:
+    """What ``run`` would do; ``plan.describe()`` says it in words."""
+    return make_plan(capture, config)
+
+
+def estimate(capture: Capture | str | Path, frame: int | None = None, **options: Any) -> Field:
+    """Measure one frame.
+
+    ``capture``: an open capture, or the path of one. ``frame``: index of the reference frame (default: the middle of those that
+    can be measured). ``options``: those of ``run`` as keywords, e.g. ``model="affine-4d", motion="rotation",
+    preshift=(-14, 0), window=65, sigma=19, stride=4, roi=(x0, y0, x1, y1)``.
+
+    Returns a Field of float32 maps [y, x]. Raises ConfigError, InputError, DeviceError.
+    """
+    if not isinstance(capture, Capture):
+        capture = open_capture(capture)
+    if frame is not None:
+        options["frames"] = f"{frame}:{frame + 1}"
+    config = load_config(overrides=options)
+    plan = make_plan(capture, config)
+    if frame is None:
+        middle = plan.frames[len(plan.frames) // 2]
+        return estimate(capture, middle, **options)
+    device = _start(config)
+    pipeline = Pipeline(plan, capture, device)
+    shape = (len(plan.y), len(plan.x))
+    maps: Maps = {name: np.full(shape, np.nan, np.float32) for name in plan.names}
+    status = np.zeros(shape, np.uint8)
+
+    def deliver(unit: Unit, found: Maps, codes: NDArray[np.uint8]) -> None:
+        for name, values in found.items():
+            maps[name][unit.rows] = values
+        status[unit.rows] = codes
+
+    pipeline.run(set(), deliver)
+    attrs = {**_provenance(plan, capture, device), "stage_seconds": pipeline.timings.seconds}
+    return Field(maps, status, np.array(plan.y), np.array(plan.x), plan.frames[0], attrs)
+
+
+def run(
+    capture: Capture | str | Path,
+    out: str | Path,
+    config: RunConfig | None = None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> RunSummary:
+    """Measure every frame of a capture into a results store.
+
+    ``resume`` goes on with an interrupted run of the same configuration and input; ``progress`` is called after every unit.
+    Raises ConfigError, InputError, DeviceError, RunError; UsageError if ``out`` exists and neither option is given.
+    """
+    began = time.perf_counter()
+    if not isinstance(capture, Capture):
+        capture = open_capture(capture)
+    config = config or RunConfig()
+    plan = make_plan(capture, config)
+    device = _start(config)
+    provenance = _provenance(plan, capture, device)
+    store = _open_store(Path(out), plan, capture, provenance, resume, overwrite)
+    done = store.done()
+    pipeline = Pipeline(plan, capture, device)
+    compile_seconds = pipeline.warm_up() if len(done) < plan.n_units else 0.0
+    todo = [u for u in plan.units() if u.index not in done]
+    pixels = {u.index: (u.rows.stop - u.rows.start) * len(plan.x) for u in todo}
+    total, finished, finished_pixels = sum(pixels.values()), 0, 0
+    computing = time.perf_counter()
+
+    def deliver(unit: Unit, maps: Maps, status: NDArray[np.uint8]) -> None:
+        nonlocal finished, finished_pixels
+        with pipeline.timings.of("write"):
+            store.write_unit(unit.index, unit.t_index, unit.rows, maps, status)
+        finished += 1
+        finished_pixels += pixels[unit.index]
+        if progress:
+            progress(Progress(finished, len(todo), finished_pixels, total, time.perf_counter() - computing))
+
+    pipeline.run(done, deliver)
+    seconds = time.perf_counter() - began
+    store.finish({"seconds": seconds, "stage_seconds": pipeline.timings.seconds})
+    counts: dict[str, int] = {}
+    for t in range(len(plan.frames)):
+        for name, n in status_counts(store.read("status", t)).items():
+            counts[name] = counts.get(name, 0) + n
+    return RunSummary(seconds, compile_seconds, str(device), counts, pipeline.timings.seconds, str(out))
+
+
+def _start(config: RunConfig) -> Device:
+    threads = config.plan.threads
+    return start(config.arch, config.precision, None if threads == "auto" else int(threads))
+
+
+def _open_store(
+    out: Path, plan: Plan, capture: Capture, provenance: dict[str, Any], resume: bool, overwrite: bool
+) -> ResultStore:
+    if resume and out.exists():
+        store = ResultStore.open(out)
+        for key in ("config", "plan", "input", "leafflow_ti_version"):
+            if store.attrs.get(key) != provenance[key]:
+                raise RunError(f"{out} cannot be resumed: its {key} differs from this run's; use --overwrite, or another output")
+        return store
+    return ResultStore.create(
+        out, frames=plan.frames, y=np.array(plan.y), x=np.array(plan.x), names=plan.names,
+        chunk=(1, plan.band_rows, len(plan.x)), attrs=provenance, interval_s=capture.frame_interval_s, overwrite=overwrite,
+    )  # fmt: skip
+
+
+def _provenance(plan: Plan, capture: Capture, device: Device) -> dict[str, Any]:
+    """What a result's reader must know: configuration, plan, versions, device, input."""
+
+    def installed(package: str) -> str:
+        try:
+            return version(package)
+        except PackageNotFoundError:
+            return "absent"
+
+    g = plan.geometry
+    return {
+        "config": plan.config.to_toml(),
+        "plan": {
+            "model": plan.model, "preshift_px": list(plan.preshift), "bands": plan.bands,
+            "f_px": g.f_px, "principal_px": list(g.principal_px), "baseline_mm": list(g.baseline_mm),
+            "disparity_offset_px": list(g.disparity_offset_px),
+        },
+        "leafflow_ti_version": __version__,
+        "versions": {"python": platform.python_version()} | {p: installed(p) for p in ("taichi", "numpy", "zarr")},
+        "device": str(device),
+        "input": capture.fingerprint(),
+    }  # fmt: skip
+
+

@@ -1,0 +1,218 @@
+"""Execution of a plan: images in, maps of one unit after the other out.
+
+The engine knows no files of results: what becomes of a unit's maps is the caller's business.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.capture import Capture
+from leafflow_ti.capture.images import read_gray
+from leafflow_ti.errors import ConfigError
+from leafflow_ti.plan import Plan, Unit
+from leafflow_ti.runtime import Device
+from leafflow_ti.stages.estimate import EstimateStage, View
+from leafflow_ti.stages.tensor import Band, TensorStage
+from leafflow_ti.status import HAS_VALUE, Status
+
+Maps = dict[str, NDArray[np.float32]]
+
+
+@dataclass
+class Timings:
+    """Seconds spent per stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def of(self, stage: str) -> Iterator[None]:
+        """Add the time of a block to one stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+@dataclass
+class _Engine:
+    """The two stages for bands of one height."""
+
+    tensor: TensorStage
+    estimate: EstimateStage
+
+
+class Pipeline:
+    """Computes the units of a plan on a device.
+
+    ``timings`` holds the seconds of the stages ``compile``, ``read``, ``tensor`` and ``estimate``.
+    Raises ConfigError for a mask that does not fit the images.
+    """
+
+    def __init__(self, plan: Plan, capture: Capture, device: Device):
+        self.plan, self.capture, self.device = plan, capture, device
+        self.timings = Timings()
+        self._engines: dict[int, _Engine] = {}
+        self._mask = _read_mask(plan.config.output.mask, capture)
+
+    def warm_up(self) -> float:
+        """Compile every kernel of the plan on a tiny band; the seconds that it took."""
+        with self.timings.of("compile"):
+            plan = self.plan
+            band = Band.of(plan.problem.sampling, 1, 1, plan.config.window.stride)
+            engine = self._make_engine(band)
+            shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
+            grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
+            tensor = None
+            while tensor is None:
+                tensor = engine.tensor.push(grey, np.ones(shape[2:], bool))
+            engine.estimate(tensor)
+            self.device.synchronize()
+        return self.timings.seconds["compile"]
+
+    def run(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
+        """Compute every unit that is not ``done`` and hand over its maps [rows, columns] and status."""
+        for band in range(self.plan.bands):
+            pending = [t for t in range(len(self.plan.frames)) if self.plan.unit(t, band).index not in done]
+            for first, last in _runs(pending):
+                for unit, maps, status in self._sequence(band, first, last):
+                    deliver(unit, maps, status)
+
+    def _make_engine(self, band: Band) -> _Engine:
+        plan = self.plan
+        tensor = TensorStage(self.device, plan.problem.columns, plan.layout, plan.problem.sampling, band)
+        return _Engine(tensor, EstimateStage(self.device, plan.problem, plan.layout, self._view(0, band, tensor.out_pitch)))
+
+    def _view(self, first_row: int, band: Band, pitch: int) -> View:
+        plan, geometry = self.plan, self.plan.geometry
+        offset = geometry.disparity_offset_px
+        shift = (plan.preshift[0] + offset[0], plan.preshift[1] + offset[1])
+        return View(
+            geometry.f_px, geometry.principal_px, geometry.baseline_mm, shift,
+            plan.x.start, plan.y[first_row], plan.x.step, band.rows, band.cols, pitch,
+        )  # fmt: skip
+
+    def _sequence(self, index: int, first: int, last: int) -> Iterator[tuple[Unit, Maps, NDArray[np.uint8]]]:
+        """The units of one band for the output frames first..last, sliding through the sequence."""
+        plan = self.plan
+        rows = plan.band(index)
+        band = Band.of(plan.problem.sampling, rows.stop - rows.start, len(plan.x), plan.config.window.stride)
+        if band.rows not in self._engines:
+            self._engines[band.rows] = self._make_engine(band)
+        engine = self._engines[band.rows]
+        engine.tensor.reset()
+        engine.estimate.set_view(self._view(rows.start, band, engine.tensor.out_pitch))
+        inside, kept = self._inside(band, rows.start)
+        latency = engine.tensor.latency
+        finite: dict[int, NDArray[np.bool_]] = {}
+        for t in range(plan.frames[first] - latency, plan.frames[last] + latency + 1):
+            with self.timings.of("read"):
+                block, finite[t] = self._read(t, band, rows.start)
+            with self.timings.of("tensor"):
+                tensor = engine.tensor.push(block, inside & kept & finite[t])
+                self.device.synchronize()
+            frame = t - latency
+            finite.pop(frame - 1, None)
+            if tensor is None:
+                continue
+            with self.timings.of("estimate"):
+                planes = engine.estimate(tensor)
+                unit = plan.unit(first + frame - plan.frames[first], index)
+                centre = _centres(band)
+                maps, status = self._maps(planes, inside[centre], kept[centre], finite[frame][centre])
+            yield unit, maps, status
+
+    def _read(self, t: int, band: Band, first_row: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Preshifted block [sy, sx, in_rows, in_cols] with non-finite values replaced by 0, and where it was finite."""
+        y0, x0 = self.plan.y[first_row] - band.halo_y, self.plan.x.start - band.halo_x
+        block = self.capture.block(
+            [t], *self.plan.cameras, y0, y0 + band.in_rows, x0, x0 + band.in_cols, self.plan.preshift, self.device.real("storage")
+        )[0]  # fmt: skip
+        finite = np.isfinite(block)
+        if finite.all():
+            return block, np.ones(block.shape[2:], bool)
+        return np.where(finite, block, 0), finite.all(axis=(0, 1))
+
+    def _inside(self, band: Band, first_row: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Where every camera of the block sees its image, and where the mask allows a measurement: [in_rows, in_cols]."""
+        plan, capture = self.plan, self.capture
+        y = plan.y[first_row] - band.halo_y + np.arange(band.in_rows)
+        x = plan.x.start - band.halo_x + np.arange(band.in_cols)
+        in_y, in_x = np.ones(y.size, bool), np.ones(x.size, bool)
+        for k in plan.cameras[0]:
+            shifted = y + plan.preshift[1] * (k - capture.reference[0])
+            in_y &= (shifted >= 0) & (shifted < capture.height)
+        for k in plan.cameras[1]:
+            shifted = x + plan.preshift[0] * (k - capture.reference[1])
+            in_x &= (shifted >= 0) & (shifted < capture.width)
+        inside = in_y[:, None] & in_x
+        if self._mask is None:
+            return inside, np.ones_like(inside)
+        kept = self._mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
+        return inside, kept
+
+    def _maps(
+        self, planes: NDArray[Any], inside: NDArray[np.bool_], kept: NDArray[np.bool_], finite: NDArray[np.bool_]
+    ) -> tuple[Maps, NDArray[np.uint8]]:
+        """Named maps, NaN where there is no value, and the status that says why."""
+        from leafflow_ti.kernels.maps import Output
+
+        status = planes[Output.STATUS].astype(np.uint8)
+        status[~inside] = Status.BORDER
+        status[~finite] = Status.NOT_FINITE
+        status[~kept] = Status.MASKED
+        empty = ~np.isin(status, HAS_VALUE)
+        maps = {}
+        for name in self.plan.names:
+            base = name.removesuffix("_std")
+            plane = _plane_of(base, self.plan.problem.columns.solutions) + (Output.STD if name != base else 0)
+            values = planes[plane].astype(np.float32)
+            values[empty] = np.nan
+            maps[name] = values
+        return maps, status
+
+
+def _plane_of(name: str, solutions: tuple[str, ...]) -> int:
+    from leafflow_ti.kernels.maps import Output
+    from leafflow_ti.plan import MOTION_NAMES
+
+    if name in MOTION_NAMES:
+        return Output.MOTION + MOTION_NAMES.index(name)
+    if name.startswith("brightness_"):
+        return Output.BRIGHTNESS + solutions.index(name.removeprefix("brightness_"))
+    return int(Output[name.upper()])
+
+
+def _centres(band: Band) -> tuple[slice, slice]:
+    """The block's pixels at the output positions."""
+    return (
+        slice(band.halo_y, band.halo_y + (band.rows - 1) * band.stride + 1, band.stride),
+        slice(band.halo_x, band.halo_x + (band.cols - 1) * band.stride + 1, band.stride),
+    )
+
+
+def _runs(indices: list[int]) -> Iterator[tuple[int, int]]:
+    """First and last of every run of consecutive numbers."""
+    start = 0
+    for i in range(1, len(indices) + 1):
+        if i == len(indices) or indices[i] != indices[i - 1] + 1:
+            yield indices[start], indices[i - 1]
+            start = i
+
+
+def _read_mask(path: Path | None, capture: Capture) -> NDArray[np.bool_] | None:
+    if path is None:
+        return None
+    mask = np.asarray(read_gray(path)) != 0
+    if mask.shape != (capture.height, capture.width):
+        raise ConfigError(f"{path}: mask of {mask.shape[1]} x {mask.shape[0]} pixels, the images have {capture.width} x {capture.height}")
+    return mask

@@ -1,0 +1,273 @@
+"""The plan of a run: a pure value that says what will be computed, from which windows, in which units, with how much memory.
+
+It is what ``--dry-run`` prints and what the pipeline executes. Making it reads no grey values, except to find a preshift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from leafflow_ti.capture import Capture, Geometry, find_preshift
+from leafflow_ti.config import RunConfig, resolve_model
+from leafflow_ti.errors import ConfigError, InputError
+from leafflow_ti.filters import choose_filter_set, filter_set
+from leafflow_ti.models import MODELS, TensorLayout, column_set, parse_rows
+from leafflow_ti.sampling import AxisSampling, Sampling
+from leafflow_ti.stages.estimate import Problem, unknowns_of
+from leafflow_ti.stages.tensor import Band, band_bytes
+
+BAND_PIXELS = 1 << 17
+"""Output pixels of a unit where memory allows: large enough to amortise halos, small enough to answer an interrupt."""
+MOTION_NAMES = tuple(f"{q}_{a}" for q in ("velocity", "rotation", "acceleration") for a in "xyz")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One band of output rows of one frame: the smallest piece that is written and resumed."""
+
+    index: int
+    t_index: int
+    band: int
+    rows: slice
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a run does; see the fields. Pixel positions of output row r and column c are ``y[r]``, ``x[c]``."""
+
+    config: RunConfig
+    model: str
+    problem: Problem
+    layout: TensorLayout
+    geometry: Geometry
+    cameras: tuple[tuple[int, ...], tuple[int, ...]]
+    """Rows and columns of the cameras that are read."""
+    preshift: tuple[int, int]
+    frames: tuple[int, ...]
+    y: range
+    x: range
+    band_rows: int
+    bytes: int
+    """Memory of the largest unit's arrays."""
+
+    @property
+    def bands(self) -> int:
+        """Units per frame."""
+        return -(-len(self.y) // self.band_rows)
+
+    @property
+    def n_units(self) -> int:
+        """Units of the run."""
+        return self.bands * len(self.frames)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Maps that the run writes, standard errors included."""
+        kept = self.config.output.arrays
+        available = tuple(n for base in self.quantities for n in (base, f"{base}_std"))
+        if kept is None:
+            return available
+        for name in kept:
+            if name not in available:
+                raise ConfigError(
+                    f"output.arrays: model '{self.model}' gives no '{name}' on this capture; it gives {', '.join(self.quantities)}"
+                )
+        return tuple(n for n in available if n in kept)
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Names of the measured maps."""
+        problem = self.problem
+        names: list[str] = []
+        if problem.terms:
+            names += ["disparity", "depth"]
+        if "x" in problem.terms:
+            names += ["slope_x", "slope_y"]
+        names += MOTION_NAMES[: problem.unknowns]
+        if "t" in problem.columns.solutions:
+            names += ["flow_x", "flow_y"]
+        if problem.columns.index("i") is not None:
+            names += [f"brightness_{a}" for a in problem.columns.solutions]
+        return tuple(names)
+
+    def band(self, index: int) -> slice:
+        """Output rows of one band."""
+        return slice(index * self.band_rows, min((index + 1) * self.band_rows, len(self.y)))
+
+    def unit(self, t_index: int, band: int) -> Unit:
+        """The unit of one frame and band."""
+        return Unit(t_index * self.bands + band, t_index, band, self.band(band))
+
+    def units(self) -> Iterator[Unit]:
+        """All units in the order in which they are computed: band by band, through the sequence."""
+        for band in range(self.bands):
+            for t_index in range(len(self.frames)):
+                yield self.unit(t_index, band)
+
+    def describe(self) -> str:
+        """The plan in words, one fact a line."""
+        problem, sampling = self.problem, self.problem.sampling
+
+        def axis(name: str) -> str:
+            plan = sampling.axis(name)
+            taps = f"{len(plan.filters.smooth)} taps" if plan.filters else "no filter"
+            return f"{name}: {taps}, window of {plan.size}"
+
+        lines = [
+            f"model       {self.model}: {MODELS[self.model].summary}, {problem.columns.n} columns, "
+            f"{len(self.layout.entries)} distinct moments, {problem.columns.n_time_like} solutions",
+            f"estimator   {problem.estimator}, solver {problem.solver}, "
+            f"{'weighted' if problem.weighted else 'plain'} least squares",
+        ]
+        if problem.unknowns:
+            rows = "+".join(problem.offsets) + ("+b5" if problem.use_range else "")
+            lines.append(f"motion      {problem.unknowns} unknowns from {2 * len(problem.offsets) + problem.use_range} rows ({rows})")
+        lines += [
+            f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
+            f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
+            f"{self.preshift[0]},{self.preshift[1]} px per step",
+            f"frames      {self.frames[0]}..{self.frames[-1]} ({len(self.frames)})",
+            f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.config.window.stride}: {', '.join(self.names)}",
+            f"units       {self.n_units}: {self.bands} bands of up to {self.band_rows} rows per frame",
+            f"memory      {self.bytes / 2**20:.0f} MiB for one unit, limit {self.config.plan.max_memory / 2**20:.0f} MiB",
+            f"disk        at most {len(self.frames) * len(self.y) * len(self.x) * (4 * len(self.names) + 1) / 2**20:.0f} MiB",
+        ]
+        return "\n".join(lines)
+
+
+def make_plan(capture: Capture, config: RunConfig) -> Plan:
+    """The plan for a capture and a configuration.
+
+    Raises ConfigError where the two do not fit, InputError where the capture is too small.
+    """
+    name = resolve_model(config.model.name, capture.n_frames, capture.n_rows, capture.n_cols)
+    model = MODELS[name]
+    _check_model(name, capture)
+    row, col = capture.reference
+    use_x = capture.n_cols > 1 and model.cameras != "reference"
+    use_y = capture.n_rows > 1 and (model.cameras == "grid" or (model.cameras == "line" and not use_x))
+    w = config.window
+    camera = ("cameras", config.filters.taps_camera, w.size_camera, w.sigma_camera, config.filters.taps)
+    time = ("frames", config.filters.taps_time, w.size_time, w.sigma_time, config.filters.taps)
+    pixel = AxisSampling.gaussian(filter_set(config.filters.taps), w.size, w.sigma)
+    sampling = Sampling(
+        pixel,
+        pixel,
+        _series(capture.n_cols, col, *camera) if use_x else AxisSampling(),
+        _series(capture.n_rows, row, *camera) if use_y else AxisSampling(),
+        _series(capture.n_frames, capture.n_frames // 2, *time, sequence=True) if model.time else AxisSampling(),
+    )
+    columns = column_set(model, config.model.brightness, sampling.camera_axes, sampling.sampled)
+    grid = bool(sampling.camera_axes)
+    unknowns = unknowns_of(config.model.motion, columns) if grid and model.time else 0
+    offsets, use_range = parse_rows(config.model.rows, name, config.model.motion, columns) if unknowns else (("1",), False)
+    if unknowns > 2 * len(offsets) + use_range:
+        raise ConfigError(
+            f"motion '{config.model.motion}' has {unknowns} unknowns, rows '{config.model.rows}' give "
+            f"{2 * len(offsets) + use_range} equations: choose more rows, a simpler motion, or more frames and cameras"
+        )
+    problem = Problem(
+        columns, sampling, config.model.estimator, config.model.solver, config.model.weighting == "wls",
+        offsets, use_range, unknowns,
+    )  # fmt: skip
+    layout = TensorLayout.of(columns)
+    x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
+    if x1 > capture.width or y1 > capture.height:
+        raise ConfigError(f"output.roi = {x0},{y0},{x1},{y1} reaches beyond the images of {capture.width} x {capture.height} pixels")
+    x, y = range(x0, x1, w.stride), range(y0, y1, w.stride)
+    rows, size = _band_rows(config, problem, layout, len(y), len(x))
+    return Plan(
+        config, name, problem, layout, _geometry(capture),
+        (_around(row, sampling.sy.radius), _around(col, sampling.sx.radius)),
+        _preshift(capture, config) if grid else (0, 0),
+        _frames(capture, config, sampling.t.radius, model.time), y, x, rows, size,
+    )  # fmt: skip
+
+
+def _around(centre: int, radius: int) -> tuple[int, ...]:
+    return tuple(range(centre - radius, centre + radius + 1))
+
+
+def _check_model(name: str, capture: Capture) -> None:
+    model = MODELS[name]
+    cameras = capture.n_rows * capture.n_cols
+    if model.cameras != "reference" and cameras == 1:
+        raise ConfigError(f"model '{name}' needs a camera grid, the capture has one camera: choose flow or flow-affine")
+    if model.time and capture.n_frames < 3:
+        raise ConfigError(f"model '{name}' needs at least 3 frames, the capture has {capture.n_frames}: choose depth")
+    if name == "affine-5d" and min(capture.n_rows, capture.n_cols) == 1:
+        raise ConfigError(
+            f"model 'affine-5d' needs a 2D camera grid, the capture has {capture.n_rows} x {capture.n_cols}: choose affine-4d"
+        )
+
+
+def _series(
+    n: int, centre: int, what: str, taps: str, size: int | str, sigma: float, largest: str, sequence: bool = False
+) -> AxisSampling:
+    """Filters and window along a camera or time axis of ``n`` samples."""
+    usable = n if sequence else 2 * min(centre, n - 1 - centre) + 1
+    usable -= 1 - usable % 2
+    chosen = choose_filter_set(usable, largest) if taps == "auto" else filter_set(taps)
+    if chosen is None or 2 * chosen.radius + 1 > usable:
+        needed = 3 if chosen is None else 2 * chosen.radius + 1
+        raise InputError(f"{n} {what} are too few: {needed} around the middle one are needed; record more, or use fewer taps")
+    longest = usable - 2 * chosen.radius
+    if size == "auto":
+        size = min(5, longest)
+    if int(size) > longest:
+        raise ConfigError(
+            f"a window of {size} {what} with {2 * chosen.radius + 1} taps needs {int(size) + 2 * chosen.radius} {what}, "
+            f"there are {usable} around the middle: choose a window of at most {longest}, or fewer taps"
+        )
+    return AxisSampling.gaussian(chosen, int(size), sigma)
+
+
+def _frames(capture: Capture, config: RunConfig, radius: int, has_time: bool) -> tuple[int, ...]:
+    wanted = config.output.frame_range(capture.n_frames)
+    if not has_time:
+        return tuple(wanted)
+    frames = tuple(t for t in wanted if radius <= t < capture.n_frames - radius)
+    if not frames:
+        raise ConfigError(
+            f"output.frames = {config.output.frames!r}: the temporal window reaches {radius} frames to each side, so frames "
+            f"{radius}:{capture.n_frames - radius} can be measured"
+        )
+    return frames
+
+
+def _geometry(capture: Capture) -> Geometry:
+    centre = ((capture.width - 1) / 2, (capture.height - 1) / 2)
+    return capture.geometry or Geometry(1.0, centre)
+
+
+def _preshift(capture: Capture, config: RunConfig) -> tuple[int, int]:
+    found = find_preshift(capture) if config.preshift == "auto" else config.preshift
+    return (found[0] if capture.n_cols > 1 else 0, found[1] if capture.n_rows > 1 else 0)
+
+
+def _band_rows(config: RunConfig, problem: Problem, layout: TensorLayout, rows: int, cols: int) -> tuple[int, int]:
+    """Rows of a unit, and the memory that it takes."""
+    itemsize = 4 if config.precision == "f32" else 8
+
+    def size(n: int) -> int:
+        band = Band.of(problem.sampling, n, cols, config.window.stride)
+        return band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
+
+    limit = int(0.8 * config.plan.max_memory)
+    if config.plan.tile != "auto":
+        chosen = min(int(config.plan.tile), rows)
+    else:
+        chosen = int(np.clip(BAND_PIXELS // cols, 16, rows)) if rows > 16 else rows
+        while chosen > 1 and size(chosen) > limit:
+            chosen = max(1, chosen * 3 // 4)
+        # Bands of equal height: the last one should not be a sliver.
+        chosen = -(-rows // -(-rows // chosen))
+    if size(chosen) > limit:
+        raise ConfigError(
+            f"a unit of {chosen} rows needs {size(chosen) / 2**20:.0f} MiB, plan.max_memory allows {limit / 2**20:.0f} MiB: "
+            "raise max_memory, lower plan.tile, use a stride, a region of interest, or a smaller window"
+        )
+    return chosen, size(chosen)
