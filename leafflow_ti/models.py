@@ -56,12 +56,6 @@ BRIGHTNESS: dict[str, tuple[str, ...]] = {
 }
 """Offsets of the intensity columns: constancy, Haussecker-Fleet (4.15), spatially varying (4.27), full (6.1)."""
 
-MOTION_UNKNOWNS: dict[str, tuple[str, ...]] = {
-    "translation": ("velocity",),
-    "rotation": ("velocity", "rotation"),
-    "acceleration": ("velocity", "rotation", "acceleration"),
-}
-
 ROW_AXES: dict[str, tuple[str, ...]] = {"2d": ("x", "y"), "as": ("sx", "sy"), "at": ("t",)}
 """Which offsets of the motion each group of rows uses, besides the motion itself (section 5.2)."""
 

@@ -7,6 +7,7 @@ engine keeps its settings: they are adopted, never replaced.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import tempfile
 import threading
@@ -136,16 +137,17 @@ def _running() -> str | None:
 def _initialise(arch: str, threads: int) -> bool:
     from leafflow_ti.kernels.engine import ti
 
+    # The engine announces its arch on standard output, which belongs to the program's results.
     try:
-        ti.init(
-            arch=getattr(ti, arch),
-            enable_fallback=False,
-            offline_cache=True,
-            offline_cache_file_path=str(cache_folder()),
-            cpu_max_num_threads=threads,
-            log_level=ti.ERROR,
-            verbose=False,
-        )
+        with contextlib.redirect_stdout(io.StringIO()):
+            ti.init(
+                arch=getattr(ti, arch),
+                enable_fallback=False,
+                offline_cache=True,
+                offline_cache_file_path=str(cache_folder()),
+                cpu_max_num_threads=threads,
+                log_level=ti.ERROR,
+            )
     except (RuntimeError, OSError):
         return False
     return True

@@ -9,7 +9,7 @@ summed. Neighbours give the disparity without ambiguity of the step, pairs furth
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,7 @@ _MIN_SIZE = 16
 _BAND_PX = (1.0, 10.0)  # standard deviations of the Gaussians whose difference is the band pass
 _CROSS_PX = 2  # misalignment across the grid axis that is tolerated
 _CLEAR = 0.3  # correlation of a clear peak; independent noise stays below 0.15
-_RIVAL = 0.98  # another peak this close to the best makes the answer ambiguous
+_REPEAT = 0.7  # an image that resembles itself elsewhere this well, relative to its neighbour, repeats itself
 _FRAMES, _LINES, _PAIRS = 2, 3, 4  # images that are compared: frames, camera lines, pairs per line
 
 _Image = npt.NDArray[np.float64]
@@ -33,8 +33,8 @@ _WAY_OUT = "give it with --preshift X,Y"
 def find_preshift(capture: Capture) -> tuple[int, int]:
     """Integer disparity ``(nx, ny)`` [px/step] that leaves the smallest residual; 0 along an axis without grid.
 
-    Raises InputError if the images have no texture, do not correlate, repeat themselves so that several disparities fit
-    equally, or move against the sign of the baseline.
+    A scene with surfaces at several depths gives that of the surface with most texture. Raises InputError if the images
+    have no texture, do not correlate, repeat themselves, or move against the sign of the baseline.
     """
     nx = _along(capture, "x") if capture.n_cols > 1 else 0.0
     ny = _along(capture, "y") if capture.n_rows > 1 else 0.0
@@ -45,8 +45,7 @@ def _along(capture: Capture, axis: str) -> float:
     """Disparity per step along one grid axis, with its fraction."""
     load = _Loader(capture, axis)
     count = capture.n_cols if axis == "x" else capture.n_rows
-    curve = _correlation(load, _pairs(capture, axis, 1))
-    nu = _neighbour_peak(capture, axis, curve)
+    nu = _neighbour_peak(capture, axis, load)
     reach = 1
     while reach < count - 1:
         wider = min(2 * reach, count - 1)
@@ -63,29 +62,37 @@ def _along(capture: Capture, axis: str) -> float:
     return nu
 
 
-def _neighbour_peak(capture: Capture, axis: str, curve: _Image) -> float:
-    """Lag of the clear and only peak, after checking that the points lie in front of the cameras."""
+def _neighbour_peak(capture: Capture, axis: str, load: Callable[[_Key], _Image]) -> float:
+    """Lag of the clear peak between neighbours, once repetition and a wrong order of the cameras are excluded."""
+    curve = _correlation(load, _pairs(capture, axis, 1))
     zero = len(curve) // 2
-    inner = curve[1:-1]
-    peaks = 1 + np.flatnonzero((inner >= curve[:-2]) & (inner > curve[2:]))
-    if len(peaks) == 0 or curve[peaks].max() < _CLEAR:
-        best = curve[peaks].max() if len(peaks) else 0.0
+    peaks = _maxima(curve)
+    height = curve[peaks].max(initial=0.0)
+    if height < _CLEAR:
         raise InputError(
-            f"no clear disparity along {axis}: neighbours correlate by {best:.2f}, {_CLEAR} is needed: {_WAY_OUT}"
+            f"no clear disparity along {axis}: neighbours correlate by {height:.2f}, {_CLEAR} is needed: {_WAY_OUT}"
         )
-    allowed = np.array([_in_front(capture, axis, int(peak) - zero) for peak in peaks])
-    best = int(peaks[np.argmax(curve[peaks])])
-    rivals = peaks[allowed & (curve[peaks] >= _RIVAL * curve[best])]
-    if len(rivals) == 0:
+    itself = _correlation(load, ((one, one) for one, _ in _pairs(capture, axis, 1)))
+    elsewhere = _maxima(itself)
+    elsewhere = elsewhere[elsewhere != zero]
+    if itself[elsewhere].max(initial=0.0) >= _REPEAT * height:
+        period = abs(int(elsewhere[np.argmax(itself[elsewhere])]) - zero)
         raise InputError(
-            f"images shift by {best - zero:+d} px per step along {axis}, against the sign of baseline_mm: "
+            f"the texture repeats every {period} px along {axis}, so that several disparities fit: {_WAY_OUT}"
+        )
+    peak = int(peaks[np.argmax(curve[peaks])])
+    if not _in_front(capture, axis, peak - zero):
+        raise InputError(
+            f"images shift by {peak - zero:+d} px per step along {axis}, against the sign of baseline_mm: "
             f"correct the baseline's sign or the order of the cameras, or {_WAY_OUT}"
         )
-    if len(rivals) > 1:
-        lags = ", ".join(str(int(peak) - zero) for peak in rivals[:4])
-        raise InputError(f"the texture repeats, disparities {lags} px per step along {axis} fit equally: {_WAY_OUT}")
-    peak = int(rivals[0])
     return peak - zero + _vertex(curve, peak)
+
+
+def _maxima(curve: _Image) -> npt.NDArray[np.intp]:
+    """Indices of the inner local maxima."""
+    inner = curve[1:-1]
+    return 1 + np.flatnonzero((inner >= curve[:-2]) & (inner > curve[2:]))
 
 
 def _in_front(capture: Capture, axis: str, lag: int) -> bool:
@@ -156,7 +163,7 @@ def _band_pass(image: _Image) -> _Image:
     return result
 
 
-def _correlation(load: Callable[[_Key], _Image], pairs: Iterator[tuple[_Key, _Key]]) -> _Image:
+def _correlation(load: Callable[[_Key], _Image], pairs: Iterable[tuple[_Key, _Key]]) -> _Image:
     """Normalised correlation for lags ``-W/2 .. W/2`` along the last axis, summed over pairs, best misalignment."""
     total: npt.NDArray[np.float64] = np.zeros(())
     for one, other in pairs:

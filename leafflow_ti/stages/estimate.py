@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.models import AXES, MOTION_UNKNOWNS, ColumnSet, TensorLayout
+from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_gain, noise_ratio
 from leafflow_ti.stages.estimators import ESTIMATORS
@@ -58,10 +58,14 @@ class Problem:
 
 
 def unknowns_of(motion: str, columns: ColumnSet) -> int:
-    """Number of motion unknowns: 3 per group; without offsets along x, y the velocity along Z is taken as zero."""
+    """How many of (N, Ω, A) one camera's flow determines.
+
+    Without offsets along x, y the velocity along Z is not seen and taken as zero; nor is, from one camera, the
+    acceleration along Z: it enters as ``A_X - x/f A_Z``, ``A_Y - y/f A_Z`` only.
+    """
     if columns.index("x", "x") is None:
         return 2
-    return 3 * len(MOTION_UNKNOWNS[motion])
+    return {"translation": 3, "rotation": 6, "acceleration": 8}[motion]
 
 
 @dataclass(frozen=True)
