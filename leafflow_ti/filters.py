@@ -1,7 +1,9 @@
 """Derivative filter sets and window weights (Schuchert 2010, Table 2.1, section 2.2).
 
 One-sided coefficients h0..hR of the antisymmetric derivative D and of the symmetric smoothing B.
-The printed four digits are renormalised so that ``sum r D_r = 1`` and ``sum B = 1`` hold exactly.
+The coefficients are renormalised so that ``sum r D_r = 1`` and ``sum B = 1`` hold exactly. The four digits printed for 7 taps
+cannot be all right (they sum to 0.9995 and 1.0004); renormalised they differentiate with a gain error of 1.8e-3 at 1.8 rad/px. The
+ones here, within 1.2e-4 of the printed, minimise the largest gain error up to there: 1e-5.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ _TABLE: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "3x1x1": ((0.0, 0.5), (1.0, 0.0)),
     "3": ((0.0, 0.5), (0.6326, 0.1837)),
     "5": ((0.0, 0.3327, 0.0836), (0.4704, 0.2415, 0.0233)),
-    "7": ((0.0, 0.2232, 0.1190, 0.0130), (0.3845, 0.2461, 0.0583, 0.0031)),
+    "7": ((0.0, 0.223320, 0.118963, 0.012918), (0.384567, 0.246220, 0.058339, 0.003158)),
 }
 FILTER_SETS = tuple(_TABLE)
 

@@ -145,6 +145,10 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
         for j in range(BLOCK):
             for m in range(BLOCK):
                 product = small.dot(ws, images + j * stride, BLOCK, images + m * stride, BLOCK, n, stride)
+                if j >= n or m >= n:
+                    # A block wider than the space: nothing but rounding is left for its last vectors, which must not win.
+                    for i in range(lanes):
+                        product[i] = ti.select(j == m, precise(1e30), precise(0.0))
                 small.store(ws, ritz + (j * BLOCK + m) * stride, product)
         small.jacobi(ws, ritz, BLOCK, RITZ_SWEEPS, stride)
         small.sort_eigen(ws, ritz, BLOCK, k, stride)

@@ -193,7 +193,9 @@ def patch_fit_kernel(spec: KernelSpec):
                     ws[target + (r * terms + term) * stride + i] = change
 
     @ti.func
-    def row_spread(base: ti.i32, stride: ti.i32, n_rows: ti.i32, first: ti.i32, number: ti.template(), ws: ti.template()):
+    def row_spread(
+        base: ti.i32, stride: ti.i32, n_rows: ti.i32, first: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
+    ):
         """Covariance of the rows: for the weights without, for the error bars with what motion and geometry share."""
         terms, rows_t, used = number[Number.TERMS], number[Number.ROWS_T], 2 * number[Number.OFFSETS]
         cov_t = base + number[Region.COV_T] * stride
@@ -231,10 +233,15 @@ def patch_fit_kernel(spec: KernelSpec):
                             own = cross + (a * rows_t + r) * stride
                             for i in range(lanes):
                                 shared[i] += ws[db + i] * ws[own + i]
-                small.store(ws, base + (number[Region.SPREAD] + tri(r, c)) * stride, spread)
                 for i in range(lanes):
                     shared[i] += spread[i]
                 small.store(ws, base + (number[Region.TOTAL] + tri(r, c)) * stride, shared)
+                caution = precise(1.0)
+                if r == used:
+                    caution = value[Value.RANGE_CAUTION] * ti.select(c == used, value[Value.RANGE_CAUTION], precise(1.0))
+                for i in range(lanes):
+                    spread[i] *= caution
+                small.store(ws, base + (number[Region.SPREAD] + tri(r, c)) * stride, spread)
 
     @ti.func
     def solve(base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()):
@@ -273,12 +280,12 @@ def patch_fit_kernel(spec: KernelSpec):
         for j in range(MAX_UNKNOWNS):
             for i in range(lanes):
                 ws[q + j * stride + i] = precise(0.0)
-        row_spread(base, stride, n_rows, 1, number, ws)
+        row_spread(base, stride, n_rows, 1, number, value, ws)
         for _ in range(number[Number.PASSES]):
             design(base, pixel, stride, n_rows, number, value, ws)
             solve(base, stride, n_rows, number, ws)
             sensitivity(base, pixel, stride, n_rows, number, value, ws)
-            row_spread(base, stride, n_rows, 0, number, ws)
+            row_spread(base, stride, n_rows, 0, number, value, ws)
         weighted = base + number[Region.WEIGHTED] * stride
         total = base + number[Region.TOTAL] * stride
         work = base + number[Region.MOTION_WORK] * stride

@@ -182,6 +182,7 @@ class Value(IntEnum):
     BASELINE = auto()  # 2
     SHIFT = BASELINE + 2  # 2: disparity that the preshift and the rectification took out, px per step
     STEP_SIZE = SHIFT + 2  # relative step of the finite differences in the motion fit
+    RANGE_CAUTION = auto()  # factor of the standard error of b_t in the weights
     GAIN = auto()  # noise gain of the gradient: x and y
     MIN_MASS = auto()
     MAX_RESIDUAL = auto()  # px, for status incoherent

@@ -4,10 +4,11 @@ Only the tables (columns, filters, noise factors) come from the library.
 """
 
 import numpy as np
-from scipy.ndimage import correlate1d
+from scipy.ndimage import correlate1d, minimum_filter
 
 from leafflow_ti.models import AXES, ColumnSet
-from leafflow_ti.sampling import Sampling, cross_noise, noise_ratio
+from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio
+from leafflow_ti.stages import estimate
 
 ARRAY_AXIS = {"t": 0, "sy": 1, "sx": 2, "y": 3, "x": 4}
 
@@ -20,8 +21,17 @@ def derivative(images, sampling: Sampling, channel: str):
     return out
 
 
-def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels):
-    """J [n, N, N] by direct sums of d d^T over the window around each pixel (x, y), middle camera and frame."""
+def filters_see(valid, sampling: Sampling):
+    """Where every pixel under the filters is valid; [t, y, x] like ``valid``."""
+    size = [2 * sampling.axis(a).filter_radius + 1 for a in ("t", "y", "x")]
+    return minimum_filter(valid.astype(float), size, mode="nearest")
+
+
+def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels, valid=None):
+    """J [n, N, N] by direct sums of d d^T over the window around each pixel (x, y), middle camera and frame.
+
+    Samples whose filters see a pixel that is not ``valid`` [t, y, x] have no weight.
+    """
     channels = {c: derivative(images, sampling, c) for c in columns.channels}
     centre = {a: images.shape[ARRAY_AXIS[a]] // 2 for a in ("t", "sy", "sx")}
     half = {a: sampling.axis(a).size // 2 for a in AXES}
@@ -32,6 +42,7 @@ def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels):
         shape = [1] * 5
         shape[ARRAY_AXIS[a]] = -1
         weight = weight * np.array(sampling.axis(a).weights).reshape(shape)
+    seen = np.ones((len(images), *images.shape[3:])) if valid is None else filters_see(valid, sampling)
     result = []
     for x, y in pixels:
         where = {**centre, "x": x, "y": y}
@@ -43,24 +54,24 @@ def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels):
                 value *= grids[a] ** e
             d.append(value.ravel())
         d = np.array(d)
-        result.append((d * weight.ravel()) @ d.T)
+        counted = weight * seen[window[0], None, None, window[3], window[4]]
+        result.append((d * counted.ravel()) @ d.T)
     return np.array(result)
 
 
 def texture_smoothness(images, sampling: Sampling, x, y):
-    """The factor ρ: energy of the gradient of the reference image smoothed once more, over its energy."""
-    centre = tuple(n // 2 for n in images.shape[:3])
-    sample = tuple(slice(c - sampling.axis(a).filter_radius, c + sampling.axis(a).filter_radius + 1) for c, a in zip(centre, ("t", "sy", "sx"), strict=True))
-    block = images[sample]
-    mid = tuple(n // 2 for n in block.shape[:3])
+    """The factor ρ: energy of the reference camera's gradient smoothed once more in x and y, over its energy."""
+    middle = [n // 2 for n in images.shape[:3]]
     h, w = sampling.y.size // 2, sampling.x.size // 2
     window = np.outer(sampling.y.weights, sampling.x.weights)
     energy = np.zeros(2)
     for channel in ("x", "y"):
-        g = derivative(block, sampling, channel)[mid]
-        smooth = correlate1d(correlate1d(g, sampling.y.kernel(False), axis=0), sampling.x.kernel(False), axis=1)
-        for k, image in enumerate((g, smooth)):
-            energy[k] += np.sum(window * image[y - h : y + h + 1, x - w : x + w + 1] ** 2)
+        gradient = derivative(images, sampling, channel)[:, middle[1], middle[2]]
+        for i, weight in enumerate(sampling.t.weights, start=middle[0] - sampling.t.size // 2):
+            smooth = correlate1d(gradient[i], sampling.y.kernel(False), axis=0)
+            smooth = correlate1d(smooth, sampling.x.kernel(False), axis=1)
+            for k, image in enumerate((gradient[i], smooth)):
+                energy[k] += weight * np.sum(window * image[y - h : y + h + 1, x - w : x + w + 1] ** 2)
     return energy[1] / energy[0]
 
 
@@ -71,7 +82,7 @@ def solutions_ols(J, columns: ColumnSet):
 
 
 def solutions_tls(J, columns: ColumnSet, noise=None):
-    """P [n_flow, k] from the k smallest eigenvectors, combined so that one time-like differential is 1 (section 3.3.2)."""
+    """P [n_flow, k] from the k smallest eigenvectors, combined so that one time-like differential is 1 (3.3.2)."""
     s = np.ones(columns.n) if noise is None else noise**-0.5
     _, vectors = np.linalg.eigh(J * np.outer(s, s))
     v = vectors[:, : columns.n_time_like] * s[:, None]
@@ -140,14 +151,14 @@ def surface(x0, y0, f, nu, b1=0.0, b2=0.0):
 
 
 def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline):
-    """Design [rows, n] and constant [rows] of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
+    """Design [rows, 9] by (N, Ω, A) of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
 
     Rows run over the directions, then the offsets. The s-offsets are per camera step at the preshifted pixel.
     """
     nu, b1, b2 = geometry
     Z0, ZX, ZY, c = surface(x0, y0, f, nu, b1, b2)
-    n = len(q)
-    N = q[:3]
+    N = np.zeros(3)
+    N[: min(3, len(q))] = q[:3]
     Zt = N[2] - ZX * N[0] - ZY * N[1]
     e = np.array([[1, 0, -x0 / f], [0, 1, -y0 / f]])
     delta = {
@@ -157,21 +168,26 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline):
         "sy": np.array([ZY * x0 / f, c + ZY * y0 / f, ZY]) / c,
         "t": Zt / (f * c) * np.array([x0, y0, f]) - N,
     }
-    b = {"x": ZX / (Z0 * c), "y": ZY / (Z0 * c), "sx": f * ZX / (Z0**2 * c), "sy": f * ZY / (Z0**2 * c), "t": f * Zt / (Z0**2 * c)}
+    b = {
+        "x": ZX / (Z0 * c),
+        "y": ZY / (Z0 * c),
+        "sx": f * ZX / (Z0**2 * c),
+        "sy": f * ZY / (Z0**2 * c),
+        "t": f * Zt / (Z0**2 * c),
+    }
     unit = np.eye(3)
 
     def row(k, o):
-        r = np.zeros(n)
+        r = np.zeros(9)
         if o == "1":
             r[:3] = -nu * e[k]
             return r
         r[:3] = -b[o] * e[k]
         if (o, k) in (("x", 0), ("y", 1)):
             r[2] += nu / f
-        if n > 3:
-            for j in range(3):
-                r[3 + j] = -nu * e[k] @ np.cross(unit[j], delta[o])
-        if n > 6 and o == "t":
+        for j in range(3):
+            r[3 + j] = -nu * e[k] @ np.cross(unit[j], delta[o])
+        if o == "t":
             r[6:9] = -nu * e[k]
         return r
 
@@ -185,20 +201,37 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline):
     return np.array([measured(k, o) for k in (0, 1) for o in offsets])
 
 
-def range_row(x0, y0, f, geometry, n):
-    """Design of the range constraint for b_t (5.23)."""
+def range_row(x0, y0, f, geometry):
+    """Design [9] of the range constraint for b_t (5.23)."""
     Z0, ZX, ZY, c = surface(x0, y0, f, *geometry)
-    r = np.zeros(n)
+    r = np.zeros(9)
     r[:3] = f / (Z0**2 * c) * np.array([-ZX, -ZY, 1.0])
     return r
 
 
-def fit_motion(x0, y0, f, P, cov, columns, geometry, offsets, use_range, n, baseline, shift, weighted=True, passes=4):
-    """Motion (N, Ω, A)[:n] and its covariance; ``geometry`` is what fit_geometry returned.
+def fit_motion(
+    x0,
+    y0,
+    f,
+    P,
+    cov,
+    columns,
+    geometry,
+    offsets,
+    use_range,
+    n,
+    baseline,
+    shift,
+    weighted=True,
+    passes=4,
+    caution=1.0,
+):
+    """The first ``n`` of (N, Ω, A) and their covariance; ``geometry`` is what fit_geometry returned.
 
     The rows' covariance holds the noise of the motion parameters, of the geometry that the design is built from, and
     what both have in common. The weights leave the common part out: b_t and a_s measure the same mixed derivative with
-    the same noise, and weights that knew it would stake everything on the difference of the two.
+    the same noise, and weights that knew it would stake everything on the difference of the two. ``caution`` multiplies
+    the standard errors of b_t and of a_s in the weights.
     """
     names, g, cov_g, cross = geometry
     k = columns.solutions.index("t")
@@ -207,6 +240,7 @@ def fit_motion(x0, y0, f, P, cov, columns, geometry, offsets, use_range, n, base
     base = cov[k, k][np.ix_(rows, rows)]
     cross = cross[:, rows]
     spread = base
+    factors = [1.0] * (2 * len(offsets)) + [caution] * use_range
     if use_range:
         it = names.index("t")
         value = np.append(value, g[it])
@@ -217,14 +251,14 @@ def fit_motion(x0, y0, f, P, cov, columns, geometry, offsets, use_range, n, base
 
     def design(geometry, q):
         A = motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline)
-        return np.vstack([A, range_row(x0, y0, f, geometry, n)]) if use_range else A
+        return np.vstack([A, range_row(x0, y0, f, geometry)])[:, :n] if use_range else A[:, :n]
 
     q = np.zeros(n)
     surface_terms = np.zeros(3)
     surface_terms[: min(3, len(g))] = g[:3]
     for _ in range(passes):
         A = design(surface_terms, q)
-        W = np.linalg.inv(spread) if weighted else np.eye(len(value))
+        W = np.linalg.inv(spread * np.outer(factors, factors)) if weighted else np.eye(len(value))
         G = np.linalg.solve(A.T @ W @ A, A.T @ W)
         q = G @ value
         D = np.zeros((len(value), len(g)))
@@ -237,3 +271,60 @@ def fit_motion(x0, y0, f, P, cov, columns, geometry, offsets, use_range, n, base
         spread = base + D @ cov_g @ D.T
         total = spread + D @ cross + cross.T @ D.T
     return q, G @ total @ G.T
+
+
+def solve(J, columns: ColumnSet, sampling: Sampling, estimator):
+    """Parameters P [n_flow, k] of one of the estimators, and the noise variance [k] of their residuals."""
+    noise = column_noise(sampling, columns)
+    if estimator == "ols":
+        P = solutions_ols(J, columns)
+    else:
+        P = solutions_tls(J, columns, noise if estimator == "tls-equilibrated" else None)
+    return P, noise_variance(J, P, columns, noise)
+
+
+def measure(J, rho, problem, view, x, y):
+    """Every map of one pixel (x, y): name -> (value, standard error). ``problem``, ``view``: what the stages get."""
+    columns, sampling = problem.columns, problem.sampling
+    P, variance = solve(J, columns, sampling, problem.estimator)
+    cov = covariances(J, variance, columns, sampling, rho)
+    x0, y0, f = x - view.principal_px[0], y - view.principal_px[1], view.f_px
+    found = {}
+    for k, axis in enumerate(columns.solutions):
+        i = columns.index("i")
+        if i is not None:
+            found[f"brightness_{axis}"] = (-P[i, k], np.sqrt(cov[k, k, i, i]))
+        if axis == "t":
+            for a in ("x", "y"):
+                i = columns.index(a)
+                found[f"flow_{a}"] = (P[i, k], np.sqrt(cov[k, k, i, i]))
+    if not problem.camera_axes:
+        return found
+    geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
+    g, cov_g = geometry[1][:3], geometry[2][:3, :3]
+    step = view.baseline_mm[0 if problem.camera_axes[0] == "sx" else 1]
+
+    def put(name, value):
+        """A function of the geometry, its error by central differences."""
+        gradient = np.zeros(len(g))
+        for i in range(len(g)):
+            d = np.zeros(len(g))
+            d[i] = 1e-5 * abs(g[0]) * (1 if i == 0 else 1 / f)
+            gradient[i] = (value(g + d) - value(g - d)) / (2 * d[i])
+        found[name] = (value(g), np.sqrt(gradient @ cov_g @ gradient))
+
+    put("disparity", lambda g: g[0] * step)
+    put("depth", lambda g: surface(x0, y0, f, *g)[0])
+    if len(g) > 1:
+        put("slope_x", lambda g: surface(x0, y0, f, *g)[1])
+        put("slope_y", lambda g: surface(x0, y0, f, *g)[2])
+    if problem.unknowns:
+        q, cov_q = fit_motion(
+            x0, y0, f, P, cov, columns, geometry, problem.offsets, problem.use_range, problem.unknowns,
+            view.baseline_mm, view.shift_px, problem.weighted, problem.passes,
+            estimate.RANGE_CAUTION,
+        )  # fmt: skip
+        names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
+        for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=True):
+            found[name] = (value, error)
+    return found

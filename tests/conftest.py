@@ -1,0 +1,282 @@
+"""Small scenes run through the stages, beside the naive twin: built once per model, brightness, grid and precision."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pytest
+from reference import chain
+
+from leafflow_ti.filters import filter_set
+from leafflow_ti.models import BRIGHTNESS, MODELS, ColumnSet, TensorLayout, column_set, parse_rows
+from leafflow_ti.plan import MOTION_NAMES
+from leafflow_ti.runtime import Device, start
+from leafflow_ti.sampling import AxisSampling, Sampling
+from leafflow_ti.stages.estimate import EstimateStage, Problem, View, unknowns_of
+from leafflow_ti.stages.tensor import Band, TensorStage
+from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
+
+GRIDS = {"single": (1, 1), "line-x": (1, 7), "line-y": (7, 1), "square": (5, 5)}
+"""Camera rows and columns. Seven cameras give three samples of 5 taps, five cameras three samples of 3 taps."""
+
+CASES = [
+    (model, brightness, grid)
+    for model, row in MODELS.items()
+    for brightness in BRIGHTNESS
+    for grid in GRIDS
+    if (row.cameras == "reference") == (grid == "single")
+    if model != "affine-5d" or grid == "square"
+    if row.time or brightness != "temporal"
+]
+"""Every model with every brightness model and every grid that it exists for."""
+
+PRESHIFT = (-8.3, 4.8)
+"""Disparity [px/step] that the rendered blocks no longer hold: integer preshift and fractional offset together."""
+
+ROWS, COLS, STRIDE = 3, 5, 2
+"""Output pixels: neither a multiple of any number of lanes."""
+
+SCENE = PlaneScene(
+    f_px=900.0,
+    baseline_mm=(0.7, -0.4),
+    n_frames=7,
+    centre=(0.3, -0.2, 80.0),
+    zx=0.5,
+    zy=-0.4,
+    velocity=(0.021, -0.014, 0.06),
+    omega=(0.002, -0.003, 0.004),
+    acceleration=(0.004, 0.003, -0.002),
+    wavelengths_mm=(0.6, 0.75),
+    alpha=0.4,
+    beta=1.0,
+    noise=1.0,
+)
+LIGHT = (
+    BrightnessTerm("t", 1, 0.01, 0.002, -0.003),
+    BrightnessTerm("t", 2, -0.001),
+    BrightnessTerm("sx", 1, 0.004),
+    BrightnessTerm("sy", 1, -0.005),
+)
+
+
+def pixel_sampling(taps: str = "5", size: int = 11, sigma: float = 3.2) -> AxisSampling:
+    """Filters and window along x and y."""
+    return AxisSampling.gaussian(filter_set(taps), size, sigma)
+
+
+def sampling_of(grid: str, time: bool, pixel: AxisSampling | None = None, cameras: str = "grid") -> Sampling:
+    """The sampling of a model with these cameras on a grid of ``GRIDS``."""
+    rows, cols = GRIDS[grid]
+    small, large = (AxisSampling.gaussian(filter_set(taps), 3, 1.0) for taps in ("3", "5"))
+    series = {1: AxisSampling(), 5: small, 7: large}
+    along_y = cameras == "grid" or (cameras == "line" and cols == 1)
+    along_x = cameras != "reference"
+    pixel = pixel or pixel_sampling()
+    return Sampling(
+        pixel, pixel, series[cols] if along_x else AxisSampling(), series[rows] if along_y else AxisSampling(),
+        series[7] if time else AxisSampling(),
+    )  # fmt: skip
+
+
+@functools.cache
+def rendered(grid: str, lit: bool, size: tuple[int, int], noise: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Preshifted blocks [t, sy, sx, y, x] of the scene, float64."""
+    n_rows, n_cols = GRIDS[grid]
+    scene = replace(SCENE, n_rows=n_rows, n_cols=n_cols, size=size, noise=noise, seed=seed)
+    scene = replace(scene, brightness=LIGHT if lit else ())
+    x, y = scene.principal
+    out = np.empty((scene.n_frames, n_rows, n_cols, size[1], size[0]))
+    for row in range(n_rows):
+        for col in range(n_cols):
+            at = (x - PRESHIFT[0] * (col - n_cols // 2), y - PRESHIFT[1] * (row - n_rows // 2))
+            out[:, row, col] = render(replace(scene, principal_px=at), cameras=([row], [col]))[:, 0, 0]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """What one ``EstimateStage`` found at every output pixel.
+
+    ``planes`` [planes, rows, cols] of ``Output``, those that the model does not have undefined; ``parameters``
+    [rows, cols, k, n_flow] of every solution and the noise ``variance`` [rows, cols, k] of its residual.
+    """
+
+    problem: Problem
+    planes: np.ndarray
+    parameters: np.ndarray
+    variance: np.ndarray
+
+    def map(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Values and standard errors [rows, cols] of a named map."""
+        from leafflow_ti.kernels.maps import Output
+
+        if name in MOTION_NAMES:
+            plane = Output.MOTION + MOTION_NAMES.index(name)
+        elif name.startswith("brightness_"):
+            plane = Output.BRIGHTNESS + self.problem.columns.solutions.index(name.removeprefix("brightness_"))
+        else:
+            plane = Output[name.upper()]
+        return self.planes[plane], self.planes[Output.STD + plane]
+
+    @property
+    def status(self) -> np.ndarray:
+        """Codes of ``Status`` [rows, cols]."""
+        from leafflow_ti.kernels.maps import Output
+
+        return self.planes[Output.STATUS].astype(int)
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """Images of one block and the stages over it.
+
+    ``images`` [t, sy, sx, y, x] hold what ``sampling`` needs around the output pixels of ``band`` and no more.
+    """
+
+    device: Device
+    images: np.ndarray
+    sampling: Sampling
+    columns: ColumnSet
+    band: Band
+    model: str = ""
+    valid: np.ndarray | None = None  # [t, y, x]
+
+    @cached_property
+    def layout(self) -> TensorLayout:
+        return TensorLayout.of(self.columns)
+
+    @cached_property
+    def _tensor(self) -> tuple[TensorStage, Any]:
+        stage = TensorStage(self.device, self.columns, self.layout, self.sampling, self.band)
+        valid = np.ones((len(self.images), *self.images.shape[3:]), bool) if self.valid is None else self.valid
+        found = [stage.push(block, ok) for block, ok in zip(self.images, valid, strict=True)]
+        assert all(tensor is None for tensor in found[:-1])
+        return stage, found[-1]
+
+    @cached_property
+    def planes(self) -> np.ndarray:
+        """Packed tensor and the planes behind it, float64 [n_entries + 3, rows, cols]."""
+        stage, tensor = self._tensor
+        shape = (-1, self.band.rows, stage.out_pitch)
+        n = (len(self.layout.entries) + 3) * shape[1] * shape[2]
+        return np.array(self.device.host(tensor)[:n], np.float64).reshape(shape)[:, :, : self.band.cols]
+
+    def tensor(self, row: int, col: int) -> np.ndarray:
+        """Full structure tensor [N, N] of one output pixel."""
+        J = np.zeros((self.columns.n, self.columns.n))
+        J[np.tril_indices(self.columns.n)] = self.planes[list(self.layout.lower), row, col]
+        return J + np.tril(J, -1).T
+
+    def position(self, row: int, col: int) -> tuple[int, int]:
+        """Pixel (x, y) of the block at which an output pixel lies."""
+        return self.band.halo_x + self.band.stride * col, self.band.halo_y + self.band.stride * row
+
+    @functools.cache  # noqa: B019 - a bench lives as long as the session
+    def reference(self, row: int, col: int) -> tuple[np.ndarray, float]:
+        """J [N, N] and ρ of one output pixel by the naive twin."""
+        at = self.position(row, col)
+        J = chain.structure_tensor(self.images, self.sampling, self.columns, [at], self.valid)[0]
+        return J, chain.texture_smoothness(self.images, self.sampling, *at)
+
+    @property
+    def scene(self) -> PlaneScene:
+        """What the reference camera of ``rendered`` sees."""
+        return replace(SCENE, size=self.images.shape[:2:-1])
+
+    @property
+    def view(self) -> View:
+        """Camera and output grid; the principal point is the one of ``rendered``."""
+        height, width = self.images.shape[3:]
+        x, y = self.position(0, 0)
+        return View(
+            SCENE.f_px, ((width - 1) / 2, (height - 1) / 2), SCENE.baseline_mm, PRESHIFT, x, y,
+            self.band.stride, self.band.rows, self.band.cols, self._tensor[0].out_pitch,
+        )  # fmt: skip
+
+    def estimate(self, motion: str | None = None, rows: str = "auto", **options: Any) -> Estimated:
+        """Run the per-pixel stages; ``motion`` None: without the motion fit."""
+        from leafflow_ti.kernels.workspace import Region
+
+        if motion is not None:
+            offsets, use_range = parse_rows(rows, self.model, motion, self.columns)
+            options |= {"offsets": offsets, "use_range": use_range, "unknowns": unknowns_of(motion, self.columns)}
+        problem = Problem(self.columns, self.sampling, **options)
+        stage = EstimateStage(self.device, problem, self.layout, self.view)
+        planes = np.array(stage(self._tensor[1]))
+        k, flow = self.columns.n_time_like, self.columns.n_flow
+        parameters = self._region(stage, Region.PARAMETERS, k * flow)
+        variance = self._region(stage, Region.VARIANCE, k)
+        return Estimated(problem, planes, parameters.reshape(*parameters.shape[:2], k, flow), variance)
+
+    def _region(self, stage: EstimateStage, region: int, size: int) -> np.ndarray:
+        """A region of the workspace, [rows, cols, size]."""
+        lanes, pixels = self.device.dense.lanes, self.band.rows * stage.view.pitch
+        groups, n, first = pixels // lanes, stage.layout.n_elements, stage.layout.offsets[region]
+        assert stage._groups >= groups, "the block is too large to be one batch"
+        workspace = np.array(self.device.host(stage._workspace))[: n * pixels]
+        # On the CPU the lanes of a group are neighbours, on a GPU the groups are: see kernels/dense.py.
+        if self.device.gpu:
+            found = workspace.reshape(n, pixels)
+        else:
+            found = workspace.reshape(groups, n, lanes).transpose(1, 0, 2).reshape(n, pixels)
+        return found[first : first + size].T.reshape(self.band.rows, -1, size)[:, : self.band.cols]
+
+
+MakeBench = Callable[..., Bench]
+
+
+@pytest.fixture(params=CASES, ids="-".join)
+def case(request: pytest.FixtureRequest) -> tuple[str, str, str]:
+    """Model, brightness and grid: the test runs for all ``CASES``."""
+    return request.param
+
+
+@pytest.fixture(params=["f64", "f32"])
+def precision(request: pytest.FixtureRequest) -> str:
+    """The test runs in both precisions."""
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def device() -> Callable[[str], Device]:
+    """The device of this process (``LEAFFLOW_TI_ARCH``, else the CPU) in a precision."""
+    return functools.cache(lambda precision: start("auto", precision))
+
+
+@pytest.fixture(scope="session")
+def bench(device: Callable[[str], Device]) -> MakeBench:
+    """``bench(model, brightness, grid, precision)``: the scene as that model sees it."""
+
+    @functools.cache
+    def make(model: str, brightness: str, grid: str, precision: str, stride: int = STRIDE, cols: int = COLS) -> Bench:
+        sampling = sampling_of(grid, MODELS[model].time, cameras=MODELS[model].cameras)
+        band = Band.of(sampling, ROWS, cols, stride)
+        images = rendered(grid, brightness != "none", (band.in_cols, band.in_rows))
+        if MODELS[model].cameras == "line" and min(GRIDS[grid]) > 1:
+            images = images[:, GRIDS[grid][0] // 2][:, None]
+        if not MODELS[model].time:
+            images = images[SCENE.n_frames // 2][None]
+        columns = column_set(MODELS[model], brightness, sampling.camera_axes, sampling.sampled)
+        return Bench(device(precision), images, sampling, columns, band, model)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_bench(device: Callable[[str], Device]) -> MakeBench:
+    """A bench for given images [t, sy, sx, y, x], with as many output pixels as they allow."""
+
+    def make(
+        images: np.ndarray, sampling: Sampling, columns: ColumnSet, precision: str = "f64",
+        shape: Sequence[int] = (1, 1), stride: int = 1, valid: np.ndarray | None = None,
+    ) -> Bench:  # fmt: skip
+        band = Band.of(sampling, *shape, stride)
+        assert images.shape[3:] == (band.in_rows, band.in_cols)
+        return Bench(device(precision), images, sampling, columns, band, valid=valid)
+
+    return make

@@ -1,0 +1,134 @@
+"""Structure tensors from the kernels against direct window sums and exact polynomials."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from reference import chain
+from tolerances import EXACT, tolerance
+
+from leafflow_ti.filters import FILTER_SETS, filter_set
+from leafflow_ti.models import AXES, MODELS, column_set
+from leafflow_ti.sampling import AxisSampling, Sampling
+
+PIXELS = ((0, 0), (1, 3), (2, 4))
+PASSES = ("t", "sy", "sx", "y", "x")
+SERIES = AxisSampling.gaussian(filter_set("3"), 3, 1.0)
+
+
+def sample_grids(sampling: Sampling) -> dict[str, np.ndarray]:
+    """Offsets from the centre along every axis, [t, sy, sx, y, x], of all samples that one pixel needs."""
+    halo = {a: sampling.axis(a).radius + (sampling.axis(a).filter_radius if a in "xy" else 0) for a in AXES}
+    axes = [np.arange(-halo[a], halo[a] + 1.0) for a in PASSES]
+    return dict(zip(PASSES, np.meshgrid(*axes, indexing="ij"), strict=True))
+
+
+def relative_error(found: np.ndarray, wanted: np.ndarray) -> float:
+    scale = np.sqrt(np.diag(wanted))
+    return float(np.max(np.abs(found - wanted) / np.outer(scale, scale)))
+
+
+def test_tensor_equals_direct_sums(bench: Callable, case: tuple[str, str, str], precision: str) -> None:
+    b = bench(*case, precision)
+    for pixel in PIXELS:
+        J, rho = b.reference(*pixel)
+        mass, energy, smooth = b.planes[-3:, *pixel]
+        limit = tolerance(b.device).tensor
+        assert relative_error(b.tensor(*pixel), J) <= limit
+        assert mass == pytest.approx(1.0, rel=limit)
+        assert smooth / energy == pytest.approx(rho, rel=limit)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3, 4])
+@pytest.mark.parametrize("cols", [1, 63, 65])
+def test_any_stride_and_width(bench: Callable, stride: int, cols: int) -> None:
+    b = bench("flow-affine", "none", "single", "f32", stride, cols)
+    for pixel in ((0, 0), (2, cols - 1), (1, cols // 2)):
+        J, rho = b.reference(*pixel)
+        assert relative_error(b.tensor(*pixel), J) <= tolerance(b.device).tensor
+        assert b.planes[-1, *pixel] / b.planes[-2, *pixel] == pytest.approx(rho, rel=tolerance(b.device).tensor)
+
+
+@pytest.mark.parametrize("taps", FILTER_SETS)
+def test_every_filter_set(make_bench: Callable, taps: str) -> None:
+    pixel = AxisSampling.gaussian(filter_set(taps), 7, 2.0)
+    sampling = Sampling(pixel, pixel, t=AxisSampling.gaussian(filter_set(taps), 3, 1.0))
+    columns = column_set(MODELS["flow-affine"], "spatial", (), sampling.sampled)
+    shape = sample_grids(sampling)["x"].shape
+    images = np.random.default_rng(5).random(shape)
+    b = make_bench(images, sampling, columns)
+    assert relative_error(b.tensor(0, 0), b.reference(0, 0)[0]) <= tolerance(b.device).tensor
+
+
+POLYNOMIALS = {
+    "line-x": ("affine-4d", Sampling(SERIES, SERIES, sx=SERIES, t=SERIES)),
+    "line-y": ("affine-4d", Sampling(SERIES, SERIES, sy=SERIES, t=SERIES)),
+    "square": ("affine-5d", Sampling(SERIES, SERIES, sx=SERIES, sy=SERIES, t=SERIES)),
+}
+
+
+@pytest.mark.parametrize("grid", POLYNOMIALS)
+def test_derivatives_of_a_quadratic_are_exact(make_bench: Callable, grid: str) -> None:
+    """On ``I = Δ^T Q Δ / 2 + g^T Δ`` every channel is known in closed form: J must be its plain window sum."""
+    model, sampling = POLYNOMIALS[grid]
+    columns = column_set(MODELS[model], "camera", sampling.camera_axes, sampling.sampled)
+    random = np.random.default_rng(3)
+    Q = random.normal(size=(5, 5))
+    Q, g = Q + Q.T, random.normal(size=5)
+    at = sample_grids(sampling)
+    delta = np.stack([at[a] for a in AXES])
+    gradient = np.einsum("ij,j...->i...", Q, delta) + g[:, None, None, None, None, None]
+    images = 0.5 * np.einsum("i...,ij,j...->...", delta, Q, delta) + np.einsum("i,i...->...", g, delta)
+    # Smoothing adds half the curvature times the filter's second moment, and leaves derivatives alone.
+    radius = {a: sampling.axis(a).filter_radius for a in AXES}
+    second = [np.sum(sampling.axis(a).kernel(False) * np.arange(-radius[a], radius[a] + 1) ** 2) for a in AXES]
+    channels = dict(zip(AXES, gradient, strict=True)) | {"i": images + 0.5 * np.dot(np.diag(Q), second)}
+
+    size = {a: sampling.axis(a).size for a in AXES}
+    window = tuple(slice((n - size[a]) // 2, (n + size[a]) // 2) for a, n in zip(PASSES, images.shape, strict=True))
+    weight = 1.0
+    for a in PASSES:
+        weight = np.multiply.outer(weight, np.array(sampling.axis(a).weights))
+    d = []
+    for column in columns.columns:
+        value = channels[column.channel][window].copy()
+        for a, power in zip(AXES, column.exponents, strict=True):
+            value *= at[a][window] ** power
+        d.append(value.ravel())
+    wanted = (np.array(d) * weight.ravel()) @ np.array(d).T
+    found = make_bench(images, sampling, columns).tensor(0, 0)
+    assert relative_error(found, wanted) <= EXACT
+
+
+def test_moments_of_a_constant_are_those_of_the_window(make_bench: Callable) -> None:
+    """On ``I = 1`` the entries of intensity × intensity are products of the windows' moments, all others vanish."""
+    _, sampling = POLYNOMIALS["square"]
+    columns = column_set(MODELS["affine-5d"], "camera", sampling.camera_axes, sampling.sampled)
+    J = make_bench(np.ones(sample_grids(sampling)["x"].shape), sampling, columns).tensor(0, 0)
+    for (i, a), (j, b) in itertools.product(enumerate(columns.columns), repeat=2):
+        both = a.channel == b.channel == "i"
+        powers = [p + q for p, q in zip(a.exponents, b.exponents, strict=True)]
+        wanted = np.prod([sampling.axis(n).moment(p) for n, p in zip(AXES, powers, strict=True)]) if both else 0.0
+        assert J[i, j] == pytest.approx(wanted, abs=1e-14)
+
+
+def test_invalid_pixels_have_no_weight(bench: Callable, make_bench: Callable) -> None:
+    """A sample counts only if its filters, in space and time, see valid pixels alone; the rest of the window stays."""
+    whole = bench("affine-4d", "camera", "line-x", "f64")
+    valid = np.ones((len(whole.images), *whole.images.shape[3:]), bool)
+    valid[2, 9, 8] = valid[:, 14, 12] = valid[:, :, 24:] = False
+    images = np.where(valid[:, None, None], whole.images, 1e6)
+    shape = (whole.band.rows, whole.band.cols)
+    b = make_bench(images, whole.sampling, whole.columns, shape=shape, stride=whole.band.stride, valid=valid)
+    seen = chain.filters_see(valid, whole.sampling)
+    for pixel in PIXELS:
+        J, _ = b.reference(*pixel)
+        assert relative_error(b.tensor(*pixel), J) <= tolerance(b.device).tensor
+        assert relative_error(J, whole.reference(*pixel)[0]) > 1e-3
+        (x, y), h, middle = b.position(*pixel), whole.sampling.x.size // 2, len(seen) // 2
+        window = seen[middle - 1 : middle + 2, y - h : y + h + 1, x - h : x + h + 1]
+        weights = (whole.sampling.axis(a).weights for a in ("t", "y", "x"))
+        assert b.planes[-3, *pixel] == pytest.approx(np.einsum("i,j,k,ijk", *weights, window))
