@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
+import tomllib
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -32,9 +33,9 @@ def plan_run(capture: Capture, config: RunConfig) -> Plan:
 def estimate(capture: Capture | str | Path, frame: int | None = None, **options: Any) -> Field:
     """Measure one frame.
 
-    ``capture``: an open capture, or the path of one. ``frame``: index of the reference frame (default: the middle of those that
-    can be measured). ``options``: those of ``run`` as keywords, e.g. ``model="affine-4d", motion="rotation",
-    preshift=(-14, 0), window=65, sigma=19, stride=4, roi=(x0, y0, x1, y1)``.
+    ``capture``: an open capture, or the path of one. ``frame``: index of the reference frame (default: the middle
+    of those that can be measured). ``options``: those of ``run`` as keywords, e.g. ``model="affine-4d",
+    motion="rotation", preshift=(-14, 0), window=65, sigma=19, stride=4, roi=(x0, y0, x1, y1)``.
 
     Returns a Field of float32 maps [y, x]. Raises ConfigError, InputError, DeviceError.
     """
@@ -74,8 +75,9 @@ def run(
 ) -> RunSummary:
     """Measure every frame of a capture into a results store.
 
-    ``resume`` goes on with an interrupted run of the same configuration and input; ``progress`` is called after every unit.
-    Raises ConfigError, InputError, DeviceError, RunError; UsageError if ``out`` exists and neither option is given.
+    ``resume`` goes on with an interrupted run of the same configuration and input; ``progress`` is called after
+    every unit. Raises ConfigError, InputError, DeviceError, RunError; UsageError if ``out`` exists and neither
+    option is given.
     """
     began = time.perf_counter()
     if not isinstance(capture, Capture):
@@ -123,13 +125,23 @@ def _open_store(
     if resume and out.exists():
         store = ResultStore.open(out)
         for key in ("config", "plan", "input", "leafflow_ti_version"):
-            if store.attrs.get(key) != provenance[key]:
-                raise RunError(f"{out} cannot be resumed: its {key} differs from this run's; use --overwrite, or another output")
+            if _decisive(store.attrs.get(key)) != _decisive(provenance[key]):
+                raise RunError(
+                    f"{out} cannot be resumed: its {key} differs from this run's; use --overwrite, or another output"
+                )
         return store
     return ResultStore.create(
         out, frames=plan.frames, y=np.array(plan.y), x=np.array(plan.x), names=plan.names,
-        chunk=(1, plan.band_rows, len(plan.x)), attrs=provenance, interval_s=capture.frame_interval_s, overwrite=overwrite,
+        chunk=(1, plan.band_rows, len(plan.x)), attrs=provenance, interval_s=capture.frame_interval_s,
+        overwrite=overwrite,
     )  # fmt: skip
+
+
+def _decisive(value: Any) -> Any:
+    """What of a provenance entry decides the results: of the configuration all but the resources of the machine."""
+    if not isinstance(value, str) or "[plan]" not in value:
+        return value
+    return {key: section for key, section in tomllib.loads(value).items() if key != "plan"}
 
 
 def _provenance(plan: Plan, capture: Capture, device: Device) -> dict[str, Any]:
@@ -154,5 +166,3 @@ def _provenance(plan: Plan, capture: Capture, device: Device) -> dict[str, Any]:
         "device": str(device),
         "input": capture.fingerprint(),
     }  # fmt: skip
-
-

@@ -26,6 +26,7 @@ Motion = Literal["translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
 Estimator = Literal["ols", "tls", "tls-equilibrated"]
 Solver = Literal["fast", "jacobi"]
+Border = Literal["full", "clip"]
 Weighting = Literal["wls", "ls"]
 Precision = Literal["f32", "f64"]
 Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
@@ -140,7 +141,11 @@ class ModelSection(_Section):
 
 
 class WindowSection(_Section):
-    """Gaussian windows. ``sigma`` left out or "auto": 19/65 of ``size``; sizes "auto": 5, or as many as there are."""
+    """Gaussian windows. ``sigma`` left out or "auto": 19/65 of ``size``; sizes "auto": 5, or as many as there are.
+
+    ``border``: "full" measures where the whole window lies inside all images, "clip" up to the image border with what
+    is left of the window: values there are noisier, and less exact where the surface turns or bends.
+    """
 
     size: Annotated[int, BeforeValidator(lambda v: _integer(v, 3, odd=True))] = 65
     sigma: _Width = 19.0
@@ -149,6 +154,7 @@ class WindowSection(_Section):
     size_camera: _AutoOdd = "auto"
     sigma_camera: _Width = 1.0
     stride: Annotated[int, BeforeValidator(lambda v: _integer(v, 1))] = 1
+    border: Border = "full"
 
     @model_validator(mode="before")
     @classmethod

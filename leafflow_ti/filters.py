@@ -1,9 +1,9 @@
 """Derivative filter sets and window weights (Schuchert 2010, Table 2.1, section 2.2).
 
-One-sided coefficients h0..hR of the antisymmetric derivative D and of the symmetric smoothing B.
-The coefficients are renormalised so that ``sum r D_r = 1`` and ``sum B = 1`` hold exactly. The four digits printed for 7 taps
-cannot be all right (they sum to 0.9995 and 1.0004); renormalised they differentiate with a gain error of 1.8e-3 at 1.8 rad/px. The
-ones here, within 1.2e-4 of the printed, minimise the largest gain error up to there: 1e-5.
+One-sided coefficients h0..hR of the antisymmetric derivative D and of the symmetric smoothing B. The coefficients
+are renormalised so that ``sum r D_r = 1`` and ``sum B = 1`` hold exactly. The four digits printed for 7 taps cannot
+be all right (they sum to 0.9995 and 1.0004); renormalised they differentiate with a gain error of 1.8e-3 at 1.8
+rad/px. The ones here, within 1.2e-4 of the printed, minimise the largest gain error up to there: 1e-5.
 """
 
 from __future__ import annotations

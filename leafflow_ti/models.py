@@ -1,10 +1,11 @@
 """The models as a table: which data columns they have, and which image parameters they yield.
 
 Conventions. Axes are named ``x, y`` (pixel, right and down), ``sx, sy`` (camera index from the reference) and ``t``
-(frame index from the reference); a monomial is the tuple of its exponents over these five axes. A *channel* is a filtered
-image: its derivative along one axis (``x``, ``y``, ``sx``, ``sy``, ``t``), or the smoothed image itself (``i``).
-A *column* of the data vector ``d`` is a channel times a monomial of the offset from the window centre
-(Schuchert 2010, Eqs. (2.3)-(2.6), (3.38), (3.39), (4.15), (4.27), (5.24), (6.10)). The time-like columns stand last.
+(frame index from the reference); a monomial is the tuple of its exponents over these five axes. A *channel* is a
+filtered image: its derivative along one axis (``x``, ``y``, ``sx``, ``sy``, ``t``), or the smoothed image itself
+(``i``). A *column* of the data vector ``d`` is a channel times a monomial of the offset from the window centre
+(Schuchert 2010, Eqs. (2.3)-(2.6), (3.38), (3.39), (4.15), (4.27), (5.24), (6.10)). The time-like columns stand
+last.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class Model:
     """One row of the table of models.
 
     ``offsets``: the axes along which the flow varies inside a window, ``"s"`` standing for every camera axis.
-    ``cameras``: ``"reference"`` (one camera), ``"line"`` (the row or column through the reference camera) or ``"grid"``.
+    ``cameras``: ``"reference"`` (one camera), ``"line"`` (the row or column through the reference camera) or
+    ``"grid"``.
     """
 
     offsets: tuple[str, ...]
@@ -152,7 +154,9 @@ def column_set(model: Model, brightness: str, camera_axes: tuple[str, ...], samp
         return [a for a in axes if a == "1" or a in sampled]
 
     if brightness == "temporal" and not model.time:
-        raise ConfigError("brightness 'temporal' needs a sequence in time; choose none, spatial or camera for a static capture")
+        raise ConfigError(
+            "brightness 'temporal' needs a sequence in time; choose none, spatial or camera for a static capture"
+        )
     flow = ["1", *expand(model.offsets)]
     columns = [Column(c, monomial(o)) for c in ("x", "y") for o in flow]
     columns += [Column("i", monomial(o)) for o in expand(BRIGHTNESS[brightness])]
@@ -179,9 +183,13 @@ def parse_rows(rows: str, model: str, motion: str, columns: ColumnSet) -> tuple[
         groups = [g for g in groups if g != "b5"]
         for g in groups:
             if g not in ROW_AXES:
-                raise ConfigError(f"rows '{rows}': unknown group '{g}'; allowed are 2d, b5, as, at joined by '+', or auto")
+                raise ConfigError(
+                    f"rows '{rows}': unknown group '{g}'; allowed are 2d, b5, as, at joined by '+', or auto"
+                )
             if not have & set(ROW_AXES[g]):
-                raise ConfigError(f"rows '{rows}': model '{model}' does not measure group '{g}' on this capture; leave it out")
+                raise ConfigError(
+                    f"rows '{rows}': model '{model}' does not measure group '{g}' on this capture; leave it out"
+                )
         if use_range and not has_range:
             raise ConfigError(f"rows '{rows}': model '{model}' does not measure b5 on this capture; leave it out")
     offsets = ("1", *(a for g in ROW_AXES if g in groups for a in ROW_AXES[g] if a in have))

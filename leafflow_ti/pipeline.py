@@ -90,7 +90,9 @@ class Pipeline:
     def _make_engine(self, band: Band) -> _Engine:
         plan = self.plan
         tensor = TensorStage(self.device, plan.problem.columns, plan.layout, plan.problem.sampling, band)
-        return _Engine(tensor, EstimateStage(self.device, plan.problem, plan.layout, self._view(0, band, tensor.out_pitch)))
+        return _Engine(
+            tensor, EstimateStage(self.device, plan.problem, plan.layout, self._view(0, band, tensor.out_pitch))
+        )
 
     def _view(self, first_row: int, band: Band, pitch: int) -> View:
         plan, geometry = self.plan, self.plan.geometry
@@ -112,6 +114,7 @@ class Pipeline:
         engine.tensor.reset()
         engine.estimate.set_view(self._view(rows.start, band, engine.tensor.out_pitch))
         inside, kept = self._inside(band, rows.start)
+        measurable = self._measurable(band, inside)
         latency = engine.tensor.latency
         finite: dict[int, NDArray[np.bool_]] = {}
         for t in range(plan.frames[first] - latency, plan.frames[last] + latency + 1):
@@ -128,14 +131,15 @@ class Pipeline:
                 planes = engine.estimate(tensor)
                 unit = plan.unit(first + frame - plan.frames[first], index)
                 centre = _centres(band)
-                maps, status = self._maps(planes, inside[centre], kept[centre], finite[frame][centre])
+                maps, status = self._maps(planes, measurable, kept[centre], finite[frame][centre])
             yield unit, maps, status
 
     def _read(self, t: int, band: Band, first_row: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Preshifted block [sy, sx, in_rows, in_cols] with non-finite values replaced by 0, and where it was finite."""
         y0, x0 = self.plan.y[first_row] - band.halo_y, self.plan.x.start - band.halo_x
         block = self.capture.block(
-            [t], *self.plan.cameras, y0, y0 + band.in_rows, x0, x0 + band.in_cols, self.plan.preshift, self.device.real("storage")
+            [t], *self.plan.cameras, y0, y0 + band.in_rows, x0, x0 + band.in_cols, self.plan.preshift,
+            self.device.real("storage"),
         )[0]  # fmt: skip
         finite = np.isfinite(block)
         if finite.all():
@@ -159,6 +163,17 @@ class Pipeline:
             return inside, np.ones_like(inside)
         kept = self._mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
         return inside, kept
+
+    def _measurable(self, band: Band, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Output pixels [rows, cols] that lie, with their whole window if it must be full, inside all images."""
+        if self.plan.config.window.border == "full":
+            for axis, plan in enumerate((self.plan.problem.sampling.y, self.plan.problem.sampling.x)):
+                along = inside.any(axis=1 - axis)
+                outside = np.concatenate([[0], np.cumsum(~along)])
+                reach = np.arange(along.size)
+                first, last = np.maximum(reach - plan.radius, 0), np.minimum(reach + plan.radius + 1, along.size)
+                inside = inside & np.expand_dims(outside[last] == outside[first], 1 - axis)
+        return inside[_centres(band)]
 
     def _maps(
         self, planes: NDArray[Any], inside: NDArray[np.bool_], kept: NDArray[np.bool_], finite: NDArray[np.bool_]
@@ -212,7 +227,8 @@ def _runs(indices: list[int]) -> Iterator[tuple[int, int]]:
 def _read_mask(path: Path | None, capture: Capture) -> NDArray[np.bool_] | None:
     if path is None:
         return None
-    mask = np.asarray(read_gray(path)) != 0
+    mask: NDArray[np.bool_] = np.asarray(read_gray(path)) != 0
     if mask.shape != (capture.height, capture.width):
-        raise ConfigError(f"{path}: mask of {mask.shape[1]} x {mask.shape[0]} pixels, the images have {capture.width} x {capture.height}")
+        found, wanted = (f"{shape[1]} x {shape[0]}" for shape in (mask.shape, (capture.height, capture.width)))
+        raise ConfigError(f"{path}: a mask of {found} pixels for images of {wanted}: make it the same size")
     return mask

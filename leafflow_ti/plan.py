@@ -1,6 +1,6 @@
-"""The plan of a run: a pure value that says what will be computed, from which windows, in which units, with how much memory.
+"""The plan of a run, a pure value: what is computed, from which windows, in which units, with how much memory.
 
-It is what ``--dry-run`` prints and what the pipeline executes. Making it reads no grey values, except to find a preshift.
+It is what ``--dry-run`` prints and what the pipeline executes. Making it reads grey values only to find a preshift.
 """
 
 from __future__ import annotations
@@ -72,9 +72,8 @@ class Plan:
             return available
         for name in kept:
             if name not in available:
-                raise ConfigError(
-                    f"output.arrays: model '{self.model}' gives no '{name}' on this capture; it gives {', '.join(self.quantities)}"
-                )
+                known = ", ".join(self.quantities)
+                raise ConfigError(f"output.arrays: model '{self.model}' gives no '{name}' here; it gives {known}")
         return tuple(n for n in available if n in kept)
 
     @property
@@ -124,16 +123,20 @@ class Plan:
         ]
         if problem.unknowns:
             rows = "+".join(problem.offsets) + ("+b5" if problem.use_range else "")
-            lines.append(f"motion      {problem.unknowns} unknowns from {2 * len(problem.offsets) + problem.use_range} rows ({rows})")
+            n_rows = 2 * len(problem.offsets) + problem.use_range
+            lines.append(f"motion      {problem.unknowns} unknowns from {n_rows} rows ({rows})")
+        pixels = len(self.frames) * len(self.y) * len(self.x)
+        limit = self.config.plan.max_memory
         lines += [
             f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
             f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
             f"{self.preshift[0]},{self.preshift[1]} px per step",
             f"frames      {self.frames[0]}..{self.frames[-1]} ({len(self.frames)})",
-            f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.config.window.stride}: {', '.join(self.names)}",
+            f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.config.window.stride}: "
+            f"{', '.join(self.names)}",
             f"units       {self.n_units}: {self.bands} bands of up to {self.band_rows} rows per frame",
-            f"memory      {self.bytes / 2**20:.0f} MiB for one unit, limit {self.config.plan.max_memory / 2**20:.0f} MiB",
-            f"disk        at most {len(self.frames) * len(self.y) * len(self.x) * (4 * len(self.names) + 1) / 2**20:.0f} MiB",
+            f"memory      {self.bytes / 2**20:.0f} MiB for one unit, limit {limit / 2**20:.0f} MiB",
+            f"disk        at most {pixels * (4 * len(self.names) + 1) / 2**20:.0f} MiB",
         ]
         return "\n".join(lines)
 
@@ -163,7 +166,10 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     columns = column_set(model, config.model.brightness, sampling.camera_axes, sampling.sampled)
     grid = bool(sampling.camera_axes)
     unknowns = unknowns_of(config.model.motion, columns) if grid and model.time else 0
-    offsets, use_range = parse_rows(config.model.rows, name, config.model.motion, columns) if unknowns else (("1",), False)
+    offsets: tuple[str, ...] = ("1",)
+    use_range = False
+    if unknowns:
+        offsets, use_range = parse_rows(config.model.rows, name, config.model.motion, columns)
     if unknowns > 2 * len(offsets) + use_range:
         raise ConfigError(
             f"motion '{config.model.motion}' has {unknowns} unknowns, rows '{config.model.rows}' give "
@@ -176,14 +182,17 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     layout = TensorLayout.of(columns)
     x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
     if x1 > capture.width or y1 > capture.height:
-        raise ConfigError(f"output.roi = {x0},{y0},{x1},{y1} reaches beyond the images of {capture.width} x {capture.height} pixels")
+        size = f"{capture.width} x {capture.height}"
+        raise ConfigError(
+            f"output.roi = {x0},{y0},{x1},{y1} reaches beyond the images of {size} pixels: make it smaller"
+        )
     x, y = range(x0, x1, w.stride), range(y0, y1, w.stride)
-    rows, size = _band_rows(config, problem, layout, len(y), len(x))
+    band_rows, memory = _band_rows(config, problem, layout, len(y), len(x))
     return Plan(
         config, name, problem, layout, _geometry(capture),
         (_around(row, sampling.sy.radius), _around(col, sampling.sx.radius)),
         _preshift(capture, config) if grid else (0, 0),
-        _frames(capture, config, sampling.t.radius, model.time), y, x, rows, size,
+        _frames(capture, config, sampling.t.radius, model.time), y, x, band_rows, memory,
     )  # fmt: skip
 
 
@@ -199,9 +208,8 @@ def _check_model(name: str, capture: Capture) -> None:
     if model.time and capture.n_frames < 3:
         raise ConfigError(f"model '{name}' needs at least 3 frames, the capture has {capture.n_frames}: choose depth")
     if name == "affine-5d" and min(capture.n_rows, capture.n_cols) == 1:
-        raise ConfigError(
-            f"model 'affine-5d' needs a 2D camera grid, the capture has {capture.n_rows} x {capture.n_cols}: choose affine-4d"
-        )
+        grid = f"{capture.n_rows} x {capture.n_cols}"
+        raise ConfigError(f"model 'affine-5d' needs a 2D camera grid, the capture has {grid}: choose affine-4d")
 
 
 def _series(
@@ -213,14 +221,16 @@ def _series(
     chosen = choose_filter_set(usable, largest) if taps == "auto" else filter_set(taps)
     if chosen is None or 2 * chosen.radius + 1 > usable:
         needed = 3 if chosen is None else 2 * chosen.radius + 1
-        raise InputError(f"{n} {what} are too few: {needed} around the middle one are needed; record more, or use fewer taps")
+        raise InputError(
+            f"{n} {what} are too few: {needed} around the middle one are needed: record more, or use 3 taps"
+        )
     longest = usable - 2 * chosen.radius
     if size == "auto":
         size = min(5, longest)
     if int(size) > longest:
         raise ConfigError(
-            f"a window of {size} {what} with {2 * chosen.radius + 1} taps needs {int(size) + 2 * chosen.radius} {what}, "
-            f"there are {usable} around the middle: choose a window of at most {longest}, or fewer taps"
+            f"a window of {size} {what} with {2 * chosen.radius + 1} taps is too long, {usable} lie around the middle one: "
+            f"choose a window of at most {longest}, or fewer taps"
         )
     return AxisSampling.gaussian(chosen, int(size), sigma)
 
@@ -232,8 +242,8 @@ def _frames(capture: Capture, config: RunConfig, radius: int, has_time: bool) ->
     frames = tuple(t for t in wanted if radius <= t < capture.n_frames - radius)
     if not frames:
         raise ConfigError(
-            f"output.frames = {config.output.frames!r}: the temporal window reaches {radius} frames to each side, so frames "
-            f"{radius}:{capture.n_frames - radius} can be measured"
+            f"output.frames = {config.output.frames!r}: the temporal window reaches {radius} frames to each side, "
+            f"so frames {radius}:{capture.n_frames - radius} can be measured"
         )
     return frames
 
@@ -267,7 +277,7 @@ def _band_rows(config: RunConfig, problem: Problem, layout: TensorLayout, rows: 
         chosen = -(-rows // -(-rows // chosen))
     if size(chosen) > limit:
         raise ConfigError(
-            f"a unit of {chosen} rows needs {size(chosen) / 2**20:.0f} MiB, plan.max_memory allows {limit / 2**20:.0f} MiB: "
-            "raise max_memory, lower plan.tile, use a stride, a region of interest, or a smaller window"
+            f"a unit of {chosen} rows needs {size(chosen) / 2**20:.0f} MiB, 80 % of plan.max_memory are "
+            f"{limit / 2**20:.0f} MiB: raise it, lower plan.tile, or use a stride, a roi, a smaller window"
         )
     return chosen, size(chosen)

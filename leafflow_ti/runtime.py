@@ -1,7 +1,7 @@
 """The compute device: the one place that starts the engine, and the arrays that live on the device.
 
-Importing this module starts nothing; ``start()`` does, once per process. A host program that has already initialised the
-engine keeps its settings: they are adopted, never replaced.
+Importing this module starts nothing; ``start()`` does, once per process. A host program that has already
+initialised the engine keeps its settings: they are adopted, never replaced.
 """
 
 from __future__ import annotations
@@ -162,9 +162,9 @@ def _usable_threads() -> int:
 def start(arch: str = "auto", precision: str = "f32", threads: int | None = None) -> Device:
     """Start the engine, or adopt the one that runs, and say on what it computes.
 
-    ``arch``: "auto" (``LEAFFLOW_TI_ARCH`` if set, else the first of cuda, metal, vulkan, cpu that starts; a software
-    Vulkan driver counts as none) or one of them. ``precision``: "f32" or "f64", of images and moments; the small dense matrices are
-    always solved in double precision where the device has it.
+    ``arch``: "auto" (``LEAFFLOW_TI_ARCH`` if set, else the first of cuda, metal, vulkan, cpu that starts; a
+    software Vulkan driver counts as none) or one of them. ``precision``: "f32" or "f64", of images and moments; the
+    small dense matrices are always solved in double precision where the device has it.
 
     Raises DeviceError if the device cannot be started, or another one already runs in this process.
     """

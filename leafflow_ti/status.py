@@ -25,10 +25,10 @@ class Status(IntEnum):
 ADVICE: dict[Status, str] = {
     Status.OK: "estimated",
     Status.NO_STRUCTURE: "the window holds no texture above the noise: enlarge the window, improve light or focus",
-    Status.APERTURE: "texture in one direction only: values along the other direction are uncertain, see the standard errors",
+    Status.APERTURE: "texture in one direction only: values along the other are uncertain, see the standard errors",
     Status.INCOHERENT: "the window's content does not move as one surface: shrink the window, or correct the preshift",
     Status.NOT_CONVERGED: "the solver found no isolated solution: use --precision f64 or a larger window",
-    Status.BORDER: "too little of the window lies inside all images: nothing to do, or a smaller window",
+    Status.BORDER: "the window is not inside all images: a smaller window, or --border clip, measures closer to the edge",
     Status.MASKED: "outside the given mask",
     Status.NOT_FINITE: "the images hold NaN or infinite grey values here",
     Status.NOT_COMPUTED: "not computed yet, or outside the region of interest",

@@ -40,6 +40,10 @@ Weighting = Annotated[str | None, _text("weighting", "wls|ls", "3D fit weighted 
 Window = Annotated[int | None, _text("window", "PIXELS", "Side of the window, odd [65].")]
 Sigma = Annotated[float | None, _text("sigma", "PIXELS", "Gaussian width of the window [19/65 of its side].")]
 Stride = Annotated[int | None, _text("stride", "PIXELS", "Measure every STRIDE-th pixel [1; preset fast: 4].")]
+Border = Annotated[
+    str | None,
+    _text("border", "full|clip", "Where the whole window is inside, or up to the border [full]."),
+]
 Taps = Annotated[str | None, _text("taps", "3x1x1|3|5|7", "Derivative filters [5].")]
 Frames = Annotated[str | None, _text("frames", "A:B", "Frame indices to measure, B excluded [all].")]
 Roi = Annotated[str | None, _text("roi", "x0,y0,x1,y1", "Pixels to measure, x1 and y1 excluded [all].")]

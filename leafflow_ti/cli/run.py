@@ -45,6 +45,7 @@ def run(
     window: options.Window = None,
     sigma: options.Sigma = None,
     stride: options.Stride = None,
+    border: options.Border = None,
     taps: options.Taps = None,
     frames: options.Frames = None,
     roi: options.Roi = None,

@@ -1,7 +1,8 @@
 """Covariances of the flow parameters, and the geometry that the camera solutions agree on.
 
-``Cov(p_i) = σ_i² ρ J_ff^-1 (J_ff ∘ K_i) J_ff^-1`` for the rows that a fit uses; K_i and the cross terms between two solutions are
-tables (see ``leafflow_ti.sampling``), ρ is the share of the texture's gradient energy that survives one more smoothing.
+``Cov(p_i) = σ_i² ρ J_ff^-1 (J_ff ∘ K_i) J_ff^-1`` for the rows that a fit uses; K_i and the cross terms between two
+solutions are tables (see ``leafflow_ti.sampling``), ρ is the share of the texture's gradient energy that survives
+one more smoothing.
 """
 
 import functools
@@ -32,8 +33,8 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def row_covariance(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, solution: ti.i32, rows_at: ti.i32, n_rows: ti.i32,
-        response_at: ti.i32, cov_at: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, solution: ti.i32, rows_at: ti.i32,
+        n_rows: ti.i32, response_at: ti.i32, cov_at: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
     ):  # fmt: skip
         """Packed covariance of the parameters listed at ``rows_at`` of one solution; keeps ``J_ff^-1 E``."""
@@ -121,9 +122,11 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                 small.store(ws, cross + (r * rows_t + c) * stride, element)
 
     @ti.func
-    def accumulate(base: ti.i32, stride: ti.i32, camera: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()):
-        """Add one camera solution to the normal equations of (nu, b_x, b_y, b_t); its cross disparity is known to be 0."""
-        terms, rows_s, rows_t, flow = number[Number.TERMS], number[Number.ROWS_S], number[Number.ROWS_T], number[Number.FLOW]
+    def accumulate(
+        base: ti.i32, stride: ti.i32, camera: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
+    ):
+        """Add one camera solution, whose cross disparity is known to be 0, to the normal equations of the geometry."""
+        terms, rows_t, flow = number[Number.TERMS], number[Number.ROWS_T], number[Number.FLOW]
         cov = base + number[Region.COV_S] * stride
         work = base + number[Region.GEOMETRY_WORK] * stride
         axis = number[Number.CAMERA_AXIS + camera]

@@ -1,9 +1,10 @@
 """Small dense matrices, one per lane: functions on a workspace whose innermost index is the lane.
 
-Element ``e`` of group ``g`` and lane ``i`` is ``ws[base + e * stride + i]``. On the CPU ``base = g n_elements lanes`` and ``stride = lanes``;
-on a GPU, with one lane, ``base = g`` and ``stride = n_groups``, so that neighbouring threads read neighbouring words.
-A lower triangle is packed by rows: element (r, c) at ``r (r + 1) / 2 + c``. Values are loaded into a local vector first and
-stored in a loop of their own: a loop that does both on one array is not vectorised.
+Element ``e`` of group ``g`` and lane ``i`` is ``ws[base + e * stride + i]``. On the CPU ``base = g n_elements
+lanes`` and ``stride = lanes``; on a GPU, with one lane, ``base = g`` and ``stride = n_groups``, so that
+neighbouring threads read neighbouring words. A lower triangle is packed by rows: element (r, c) at
+``r (r + 1) / 2 + c``. Values are loaded into a local vector first and stored in a loop of their own: a loop that does both on one
+array is not vectorised.
 """
 
 import functools
@@ -148,7 +149,7 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def jacobi(ws: ti.template(), a: ti.i32, n: ti.i32, sweeps: ti.i32, stride: ti.i32):
-        """Cyclic Jacobi: diagonalises the full matrix [n, n] at ``a``; the columns of V, right behind it, are the vectors.
+        """Cyclic Jacobi: diagonalises the matrix [n, n] at ``a``; V, right behind it, gets the eigenvectors as columns.
 
         A lane whose off-diagonal element is negligible rotates by nothing, so a lane's result does not depend on its
         neighbours, however many sweeps they need.
@@ -177,7 +178,9 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                             apq = ws[pq + i]
                             turned[i] = ti.cast(apq * apq > precise(negligible) * ti.abs(app * aqq), ti.i32)
                             theta = (aqq - app) / ti.select(turned[i] == 1, precise(2.0) * apq, precise(1.0))
-                            t = ti.select(theta >= 0, precise(1.0), precise(-1.0)) / (ti.abs(theta) + ti.sqrt(theta * theta + precise(1.0)))
+                            t = ti.select(theta >= 0, precise(1.0), precise(-1.0)) / (
+                                ti.abs(theta) + ti.sqrt(theta * theta + precise(1.0))
+                            )
                             t = ti.select(turned[i] == 1, t, precise(0.0))
                             cosine[i] = precise(1.0) / ti.sqrt(t * t + precise(1.0))
                             sine[i] = t * cosine[i]
@@ -203,7 +206,7 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def sort_eigen(ws: ti.template(), a: ti.i32, n: ti.i32, k: ti.i32, stride: ti.i32):
-        """Bring the k + 1 smallest diagonal elements of [n, n] at ``a``, with the columns of V behind it, to the front."""
+        """Bring the k + 1 smallest diagonal elements of [n, n] at ``a``, and their columns of V, to the front."""
         for j in range(ti.min(k + 1, n)):
             for m in range(j + 1, n):
                 swap = ti.Vector.zero(ti.i32, lanes)

@@ -106,7 +106,9 @@ def maps_kernel(spec: KernelSpec):
                         # slope = c b Z0, and c depends on both: gradient by (nu, b_x, b_y).
                         own = Z0 * b[k]
                         gradient = ti.Vector.zero(precise, 3)
-                        gradient[0] = c * (-own / nu) * (1 - c * own * ray[k]) + c * c * own * Z0 * b[1 - k] * ray[1 - k] / nu
+                        gradient[0] = (
+                            c * (-own / nu) * (1 - c * own * ray[k]) + c * c * own * Z0 * b[1 - k] * ray[1 - k] / nu
+                        )
                         gradient[1 + k] = c * Z0 * (1 - c * own * ray[k])
                         gradient[2 - k] = -c * c * own * Z0 * ray[1 - k]
                         variance = precise(0.0)

@@ -1,8 +1,8 @@
 """From the packed structure tensor to the flow parameters of every solution.
 
-All work is on the scaled tensor ``A = S J S``; with S = C^-1/2 its smallest eigenvectors solve the equilibrated total
-least-squares problem, with S = 1 the plain one (2.17). One Cholesky factor serves the least-squares solution (2.15), the
-inverse iteration that starts from it, and the residuals.
+All work is on the scaled tensor ``A = S J S``; with S = C^-1/2 its smallest eigenvectors solve the equilibrated
+total least-squares problem, with S = 1 the plain one (2.17). One Cholesky factor serves the least-squares solution
+(2.15), the inverse iteration that starts from it, and the residuals.
 """
 
 import functools
@@ -146,7 +146,7 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
             for m in range(BLOCK):
                 product = small.dot(ws, images + j * stride, BLOCK, images + m * stride, BLOCK, n, stride)
                 if j >= n or m >= n:
-                    # A block wider than the space: nothing but rounding is left for its last vectors, which must not win.
+                    # A block wider than the space: rounding is all that is left for its last vectors.
                     for i in range(lanes):
                         product[i] = ti.select(j == m, precise(1e30), precise(0.0))
                 small.store(ws, ritz + (j * BLOCK + m) * stride, product)

@@ -1,7 +1,7 @@
 """Motion of the surface patch: least squares of (N, Ω, A) from the motion rows and the range constraint.
 
-Schuchert 2010, Eqs. (5.8), (5.18), (5.23) with the errata of the model contract: the time column uses ``∂X/∂t - N``, and
-preshifted data measure ``b a_s + nu0 a_x`` along a camera axis.
+Schuchert 2010, Eqs. (5.8), (5.18), (5.23) with the errata of the model contract: the time column uses ``∂X/∂t -
+N``, and preshifted data measure ``b a_s + nu0 a_x`` along a camera axis.
 """
 
 import functools
@@ -114,7 +114,9 @@ def patch_fit_kernel(spec: KernelSpec):
     small, patch = dense(spec), patch_functions(spec)
 
     @ti.func
-    def any_row(r: ti.i32, ray: ti.template(), s: ti.template(), N: ti.template(), number: ti.template(), value: ti.template()):
+    def any_row(
+        r: ti.i32, ray: ti.template(), s: ti.template(), N: ti.template(), number: ti.template(), value: ti.template()
+    ):
         offsets = number[Number.OFFSETS]
         row = patch.range_row(value[Value.F], s)
         if r < 2 * offsets:
@@ -124,7 +126,13 @@ def patch_fit_kernel(spec: KernelSpec):
 
     @ti.func
     def design(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
+        base: ti.i32,
+        pixel: ti.i32,
+        stride: ti.i32,
+        n_rows: ti.i32,
+        number: ti.template(),
+        value: ti.template(),
+        ws: ti.template(),
     ):
         """Rows of the system, linearised about the present motion, and their measured values."""
         flow, terms, offsets = number[Number.FLOW], number[Number.TERMS], number[Number.OFFSETS]
@@ -152,7 +160,13 @@ def patch_fit_kernel(spec: KernelSpec):
 
     @ti.func
     def sensitivity(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
+        base: ti.i32,
+        pixel: ti.i32,
+        stride: ti.i32,
+        n_rows: ti.i32,
+        number: ti.template(),
+        value: ti.template(),
+        ws: ti.template(),
     ):
         """Derivative of the rows' residual by the geometry, by central differences."""
         terms = number[Number.TERMS]
@@ -194,7 +208,13 @@ def patch_fit_kernel(spec: KernelSpec):
 
     @ti.func
     def row_spread(
-        base: ti.i32, stride: ti.i32, n_rows: ti.i32, first: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
+        base: ti.i32,
+        stride: ti.i32,
+        n_rows: ti.i32,
+        first: ti.i32,
+        number: ti.template(),
+        value: ti.template(),
+        ws: ti.template(),
     ):
         """Covariance of the rows: for the weights without, for the error bars with what motion and geometry share."""
         terms, rows_t, used = number[Number.TERMS], number[Number.ROWS_T], 2 * number[Number.OFFSETS]
@@ -238,7 +258,9 @@ def patch_fit_kernel(spec: KernelSpec):
                 small.store(ws, base + (number[Region.TOTAL] + tri(r, c)) * stride, shared)
                 caution = precise(1.0)
                 if r == used:
-                    caution = value[Value.RANGE_CAUTION] * ti.select(c == used, value[Value.RANGE_CAUTION], precise(1.0))
+                    caution = value[Value.RANGE_CAUTION] * ti.select(
+                        c == used, value[Value.RANGE_CAUTION], precise(1.0)
+                    )
                 for i in range(lanes):
                     spread[i] *= caution
                 small.store(ws, base + (number[Region.SPREAD] + tri(r, c)) * stride, spread)

@@ -1,8 +1,8 @@
 """Planes of images: correlations, and sums of products.
 
-A plane is ``[rows, pitch]``, ``pitch`` a multiple of the lanes; a stack of planes is one flat array. Which planes, shifts and
-weights make up which output is data (tables of terms), not code: the same two kernels filter along every axis, sum over
-cameras and frames, and convolve with every moment window, for every model.
+A plane is ``[rows, pitch]``, ``pitch`` a multiple of the lanes; a stack of planes is one flat array. Which planes,
+shifts and weights make up which output is data (tables of terms), not code: the same two kernels filter along every
+axis, sum over cameras and frames, and convolve with every moment window, for every model.
 """
 
 import functools

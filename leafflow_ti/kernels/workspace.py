@@ -1,8 +1,8 @@
 """What the per-pixel kernels share: the workspace of a batch of pixels, and the tables that describe a model to them.
 
-Every per-pixel stage is a function of one group of pixels. It works in regions of one flat workspace (see ``dense``) and
-reads what it needs to know from two tables: ``number`` (int32: region offsets, sizes, lists of rows) and ``value`` (scales,
-noise factors, camera). One compilation of a stage serves every model.
+Every per-pixel stage is a function of one group of pixels. It works in regions of one flat workspace (see
+``dense``) and reads what it needs to know from two tables: ``number`` (int32: region offsets, sizes, lists of rows)
+and ``value`` (scales, noise factors, camera). One compilation of a stage serves every model.
 """
 
 import functools
@@ -129,7 +129,7 @@ class Layout:
     def offsets(self) -> np.ndarray:
         """First element of each region, int32 [len(Region)]."""
         sizes = self.sizes
-        return np.cumsum([0] + [sizes[r] for r in Region][:-1]).astype(np.int32)
+        return np.cumsum([0, *(sizes[r] for r in Region)])[:-1].astype(np.int32)
 
     @property
     def n_elements(self) -> int:
@@ -195,9 +195,10 @@ class Value(IntEnum):
 
 @functools.cache
 def batch_kernel(spec: KernelSpec, body):
-    """A kernel that applies ``body(base, pixel, stride, n_pixels, number, value, J, ws, out)`` to every group of a batch.
+    """A kernel: ``body(base, pixel, stride, n_pixels, number, value, J, ws, out)`` for every group of a batch.
 
-    ``base``: the group's place in the workspace; ``pixel``: its first pixel; ``stride``: distance of workspace elements.
+    ``base``: the group's place in the workspace; ``pixel``: its first pixel; ``stride``: distance of workspace
+    elements.
     """
     real, precise, lanes = spec.real, spec.precise, spec.lanes
 
@@ -217,7 +218,9 @@ def batch_kernel(spec: KernelSpec, body):
     ):
         if ti.static(spec.gpu):
             for g in range(n_groups):
-                body(g * group_step, first_pixel + g * lanes, stride, n_pixels, number_in, value_in, J_in, ws_io, map_out)
+                body(
+                    g * group_step, first_pixel + g * lanes, stride, n_pixels, number_in, value_in, J_in, ws_io, map_out
+                )
         else:
             for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
                 if part == 0:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.models import AXES, ColumnSet, TensorLayout
+from leafflow_ti.models import AXES, Column, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_gain, noise_ratio
 from leafflow_ti.stages.estimators import ESTIMATORS
@@ -22,8 +22,9 @@ GAP = {"f64": 1e-6, "f32": 1e-3}
 RANGE_CAUTION = 3.0
 """Factor of the standard error of b_t in the weights of the motion fit.
 
-The range constraint suffers most from what the affine model leaves out (on a turning 60° face it is off by 2.6 % without
-any noise), and ``a_s`` measures the same mixed derivative from the same noise: its own error alone would overrate it.
+The range constraint suffers most from what the affine model leaves out (on a turning 60° face it is off by 2.6 %
+without any noise), and ``a_s`` measures the same mixed derivative from the same noise: its own error alone would
+overrate it.
 """
 STEP_SIZE = {"f64": 1e-4, "f32": 1e-2}
 MIN_MASS = 0.2
@@ -158,7 +159,7 @@ class EstimateStage:
         number[Number.RANGE_TERM] = problem.terms.index("t") if "t" in problem.terms else -1
         number[Number.CAMERA_SOLUTIONS] = len(problem.camera_axes)
         number[Number.EXTRA] = len(layout.entries)
-        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = columns.index("x"), columns.index("y")
+        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = [columns.columns.index(Column(c)) for c in ("x", "y")]
         for i, o in enumerate(problem.offsets):
             number[Number.OFFSET_CODES + i] = 0 if o == "1" else 1 + AXES.index(o)
         number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows.motion)] = rows.motion

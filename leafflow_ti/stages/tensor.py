@@ -1,9 +1,9 @@
 """Structure tensors of one band of the image, from raw frames, frame by frame.
 
-``J = Σ w d d^T`` as moments of products (2.17, 2.20). For every new frame the band's images are filtered along t, sy, sx, y and x, the products
-of channels are summed over the camera samples, and the result is kept as this frame's *maps*. A tensor is a weighted sum
-of the maps of the frames of its window, convolved with moment windows along y and x. Nothing is computed twice when the
-window moves on by a frame.
+``J = Σ w d d^T`` as moments of products (2.17, 2.20). For every new frame the band's images are filtered along t,
+sy, sx, y and x, the products of channels are summed over the camera samples, and the result is kept as this frame's
+*maps*. A tensor is a weighted sum of the maps of the frames of its window, convolved with moment windows along y
+and x. Nothing is computed twice when the window moves on by a frame.
 """
 
 from __future__ import annotations
@@ -42,7 +42,11 @@ class Band:
     def of(cls, sampling: Sampling, rows: int, cols: int, stride: int) -> Band:
         """The halo holds the window, the filters, and the filters once more for the texture's smoothness."""
         return cls(
-            rows, cols, stride, sampling.y.radius + sampling.y.filter_radius, sampling.x.radius + sampling.x.filter_radius
+            rows,
+            cols,
+            stride,
+            sampling.y.radius + sampling.y.filter_radius,
+            sampling.x.radius + sampling.x.filter_radius,
         )
 
     @property
@@ -83,7 +87,15 @@ def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, ban
     tall = {(e.channels, e.exponents[1:]) for e in layout.entries}
     extra = EXTRA_PLANES
     scratch = max(2 * cameras, 3 * samples * channels)
-    wide = taps * cameras + 2 * scratch + samples * channels + extra + sampling.t.size * (len(maps) + extra) + len(sums) + extra
+    wide = (
+        taps * cameras
+        + 2 * scratch
+        + samples * channels
+        + extra
+        + sampling.t.size * (len(maps) + extra)
+        + len(sums)
+        + extra
+    )
     pitch, out_pitch = round_up(band.in_cols, 64), round_up(band.cols, 64)
     output = len(layout.entries) + extra + OUTPUT_PLANES
     return itemsize * (
@@ -94,7 +106,15 @@ def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, ban
 class Filtering:
     """One launch of the plane filter with its tables on the device."""
 
-    def __init__(self, device: Device, outputs: list[list[tuple[int, float]]], rows: int, pitch: int, row_step: int, col_step: int = 1):
+    def __init__(
+        self,
+        device: Device,
+        outputs: list[list[tuple[int, float]]],
+        rows: int,
+        pitch: int,
+        row_step: int,
+        col_step: int = 1,
+    ):
         terms = Terms.of(outputs)
         self.device, self.rows, self.pitch, self.row_step, self.col_step = device, rows, pitch, row_step, col_step
         self.n_planes = len(outputs)
@@ -122,8 +142,9 @@ def round_up(n: int, multiple: int) -> int:
 class TensorStage:
     """Turns a stream of frames of one band into structure tensors.
 
-    ``push`` takes one frame's block [n_sy, n_sx, in_rows, in_cols] (preshifted) and its validity; once the window is full it
-    returns the packed tensor [n_entries + EXTRA_PLANES, rows, pitch] as a flat device array, valid until the next call.
+    ``push`` takes one frame's block [n_sy, n_sx, in_rows, in_cols] (preshifted) and its validity; once the window
+    is full it returns the packed tensor [n_entries + EXTRA_PLANES, rows, pitch] as a flat device array, valid until
+    the next call.
     """
 
     def __init__(self, device: Device, columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band):
@@ -165,12 +186,14 @@ class TensorStage:
                 continue
             if axis == "y":
                 rows -= 2 * plan.filter_radius
-            differentiated = {None} if None in wanted or wanted & set(_PASSES[i + 1 :]) else set()
+            differentiated: set[str | None] = {None} if None in wanted or wanted & set(_PASSES[i + 1 :]) else set()
             differentiated |= wanted & set(_PASSES[: i + 1])
             phases = []
             # The frames lie in a ring: which slot is the oldest changes with every frame.
             for oldest in range(self.n_taps if axis == "t" else 1):
-                moved = {((k[0] - oldest) % self.n_taps, *k[1:]): at for k, at in planes.items()} if axis == "t" else planes
+                moved = (
+                    {((k[0] - oldest) % self.n_taps, *k[1:]): at for k, at in planes.items()} if axis == "t" else planes
+                )
                 outputs = self._axis_pass(axis, moved, differentiated)
                 phases.append(Filtering(self.device, list(outputs.values()), rows, self.pitch, self.pitch))
             self._passes.append(phases)
@@ -212,7 +235,9 @@ class TensorStage:
 
         def smooth(planes: list[int], axis: str, step: int) -> Filtering:
             weights = self.sampling.axis(axis).kernel(False)
-            outputs = [[(p * self._plane_size + r * step, float(w)) for r, w in enumerate(weights) if w] for p in planes]
+            outputs = [
+                [(p * self._plane_size + r * step, float(w)) for r, w in enumerate(weights) if w] for p in planes
+            ]
             return Filtering(self.device, outputs, self.map_rows, self.pitch, self.pitch)
 
         self._smoothing = (smooth(self._gradient, "y", self.pitch), smooth([0, 1], "x", 1))

@@ -147,7 +147,8 @@ def truth(scene: CubeScene) -> dict[str, Array]:
     """What the middle camera sees at the middle frame, at the pixel centres; NaN beside the box.
 
     ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] mm/frame and ``acceleration`` [H, W, 3] mm/frame² of
-    the point seen; ``omega`` [3] rad/frame; ``face`` [H, W] integer label, 0 beside the box (see FACES).
+    the point seen; ``flow`` [H, W, 2] px/frame; ``omega`` [3] rad/frame; ``face`` [H, W] integer label, 0 beside the
+    box (see FACES).
     """
     camera = np.zeros(3)
     x, y = scene.ray_axes()
@@ -159,7 +160,8 @@ def truth(scene: CubeScene) -> dict[str, Array]:
         zx[hits.inside] = -normal[0] / normal[2]
         zy[hits.inside] = -normal[1] / normal[2]
         face[hits.inside] = hits.face + 1
-    velocity, acceleration = scene.point_motion(depth[..., None] * scene.rays())
+    points = depth[..., None] * scene.rays()
+    velocity, acceleration = scene.point_motion(points)
     return {
         "depth": depth,
         "zx": zx,
@@ -167,6 +169,7 @@ def truth(scene: CubeScene) -> dict[str, Array]:
         "velocity": velocity,
         "omega": np.array(scene.omega),
         "acceleration": acceleration,
+        "flow": scene.image_motion(points, velocity),
         "face": face,
     }
 

@@ -51,3 +51,8 @@ class RigidScene(CameraGrid):
         omega = np.array(self.omega)
         turning = np.cross(omega, points - self.pivot)
         return np.array(self.velocity) + turning, np.array(self.acceleration) + np.cross(omega, turning)
+
+    def image_motion(self, points: Array, velocity: Array) -> Array:
+        """Optical flow [..., 2] px/frame in the middle camera of ``points`` [..., 3] that move with ``velocity``."""
+        forward = velocity[..., 2:] * points[..., :2] / points[..., 2:]
+        return np.asarray(self.f_px * (velocity[..., :2] - forward) / points[..., 2:])

@@ -136,7 +136,8 @@ def truth(scene: PlaneScene) -> dict[str, Array]:
     """What the middle camera sees at the middle frame.
 
     ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] = N + Ω × (X - Xr) mm/frame, of the point seen at the
-    pixel; ``omega`` [3] rad/frame; ``acceleration`` [H, W, 3] = A + Ω × (Ω × (X - Xr)) mm/frame².
+    pixel; ``omega`` [3] rad/frame; ``acceleration`` [H, W, 3] = A + Ω × (Ω × (X - Xr)) mm/frame²;
+    ``flow`` [H, W, 2] px/frame.
     """
     points = scene.intersect(scene.rays(), np.zeros(3), 0.0)
     velocity, acceleration = scene.point_motion(points)
@@ -147,6 +148,7 @@ def truth(scene: PlaneScene) -> dict[str, Array]:
         "velocity": velocity,
         "omega": np.array(scene.omega),
         "acceleration": acceleration,
+        "flow": scene.image_motion(points, velocity),
     }
 
 

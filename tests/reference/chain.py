@@ -231,7 +231,7 @@ def fit_motion(
     The rows' covariance holds the noise of the motion parameters, of the geometry that the design is built from, and
     what both have in common. The weights leave the common part out: b_t and a_s measure the same mixed derivative with
     the same noise, and weights that knew it would stake everything on the difference of the two. ``caution`` multiplies
-    the standard errors of b_t and of a_s in the weights.
+    the standard error of b_t in the weights.
     """
     names, g, cov_g, cross = geometry
     k = columns.solutions.index("t")

@@ -1,7 +1,8 @@
 """Total least squares (Schuchert 2010, Eq. (2.17)): the null space of the structure tensor.
 
-In raw units, or equilibrated: with the columns scaled to equal noise it minimises ``p^T J p / p^T C p``, whatever their units.
-The null space comes from a block inverse iteration that starts at the least-squares solution, or from a full cyclic Jacobi.
+In raw units, or equilibrated: with the columns scaled to equal noise it minimises ``p^T J p / p^T C p``, whatever
+their units. The null space comes from a block inverse iteration that starts at the least-squares solution, or from
+a full cyclic Jacobi.
 """
 
 from __future__ import annotations

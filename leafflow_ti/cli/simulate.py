@@ -1,0 +1,298 @@
+"""``simulate``: synthetic captures with their exact truth.
+
+Options are plain strings and numbers; one table turns them into fields of the scene, which checks them.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from leafflow_ti.errors import UsageError
+
+if TYPE_CHECKING:
+    from leafflow_ti.synthetic.write import Scene
+
+app = typer.Typer(
+    name="simulate",
+    help="Write a synthetic capture (capture.toml, TIFF images) with its exact truth (truth.npz).",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+
+def _keep(option: str, value: Any) -> Any:
+    return value
+
+
+def _numbers(*counts: int) -> Callable[[str, str], tuple[float, ...]]:
+    """Converter of ``a,b,c`` with one of the given counts of numbers."""
+
+    def convert(option: str, text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            raise UsageError(f"{option} {text}: must be numbers with commas between, e.g. 1,0.5") from None
+        if len(values) not in counts:
+            raise UsageError(f"{option} {text}: {' or '.join(map(str, counts))} numbers are needed, not {len(values)}")
+        return values
+
+    return convert
+
+
+def _pair(option: str, text: str) -> tuple[float, float]:
+    """``a,b``, or ``a`` for ``a,a``."""
+    values = _numbers(1, 2)(option, text)
+    return values[0], values[-1]
+
+
+def _degrees(option: str, value: float) -> float:
+    return math.radians(value)
+
+
+def _degrees_xyz(option: str, text: str) -> tuple[float, ...]:
+    return tuple(math.radians(value) for value in _numbers(3)(option, text))
+
+
+def _size(option: str, text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise UsageError(f"{option} {text}: must be WIDTHxHEIGHT in pixels, e.g. 301x301")
+    return int(width), int(height)
+
+
+def _bits(option: str, text: str) -> int | None:
+    if text == "float":
+        return None
+    if not text.isdecimal():
+        raise UsageError(f"{option} {text}: choose 8, 10, 12, 14, 16 or float")
+    return int(text)
+
+
+def _brightness(option: str, texts: list[str]) -> tuple[Any, ...]:
+    from leafflow_ti.synthetic.plane import BrightnessTerm
+
+    terms = []
+    for text in texts:
+        axis, _, rest = text.partition(",")
+        power, _, coefficients = rest.partition(",")
+        if axis not in ("t", "sx", "sy") or not power.isdecimal():
+            raise UsageError(f"{option} {text}: must be AXIS,POWER,G[,GX,GY] with AXIS t, sx or sy, e.g. t,1,0.01")
+        terms.append(BrightnessTerm(axis, int(power), *_numbers(1, 3)(option, coefficients)))  # type: ignore[arg-type]
+    return tuple(terms)
+
+
+FIELDS: dict[str, tuple[str, Callable[[str, Any], Any]]] = {
+    "cameras": ("n_cols", _keep),
+    "rows": ("n_rows", _keep),
+    "frames": ("n_frames", _keep),
+    "size": ("size", _size),
+    "noise": ("noise", _keep),
+    "seed": ("seed", _keep),
+    "bits": ("bits", _bits),
+    "focal_px": ("f_px", _keep),
+    "principal_px": ("principal_px", _numbers(2)),
+    "baseline_mm": ("baseline_mm", _pair),
+    "velocity": ("velocity", _numbers(3)),
+    "omega_deg": ("omega", _degrees_xyz),
+    "rotation_centre_mm": ("rotation_centre", _numbers(3)),
+    "acceleration": ("acceleration", _numbers(3)),
+    "wavelength_mm": ("wavelengths_mm", _pair),
+    "offset": ("offset", _keep),
+    # plane
+    "slope_x": ("zx", _keep),
+    "slope_y": ("zy", _keep),
+    "amplitude": ("amplitude", _keep),
+    "alpha_deg": ("alpha", _degrees),
+    "beta_deg": ("beta", _degrees),
+    "brightness": ("brightness", _brightness),
+    # cube
+    "edges_mm": ("edges_mm", _numbers(3)),
+    "orientation_deg": ("orientation", _degrees_xyz),
+    "contrast": ("contrast", _keep),
+    "background": ("background", _keep),
+    "texture_seed": ("texture_seed", _keep),
+    "supersampling": ("supersampling", _keep),
+    "light": ("light", _keep),
+    "light_mm": ("light_mm", _numbers(3)),
+    "light_target_mm": ("light_target_mm", _numbers(3)),
+    "light_cone_deg": ("light_cone", _degrees),
+    "ambient_share": ("ambient_share", _keep),
+}
+"""Parameter of a command -> field of the scene and how the value is read."""
+
+
+def _option(name: str, metavar: str, help: str) -> Any:
+    return typer.Option(f"--{name}", metavar=metavar, help=help, show_default=False)
+
+
+Folder = Annotated[Path, typer.Argument(metavar="OUTDIR", help="Folder to create.")]
+Cameras = Annotated[int | None, _option("cameras", "N", "Cameras along x [9].")]
+Rows = Annotated[int | None, _option("rows", "N", "Rows of cameras, along y [1].")]
+Frames = Annotated[int | None, _option("frames", "N", "Frames [9].")]
+Size = Annotated[str, _option("size", "WxH", "Image size in pixels [301x301].")]
+Noise = Annotated[float | None, _option("noise", "GREY", "Standard deviation of noise, in grey values of 8 bits [0].")]
+Seed = Annotated[int | None, _option("seed", "N", "Seed of the noise [0].")]
+Bits = Annotated[str, _option("bits", "8|10|12|14|16|float", "Depth of the images; grey values scale with it [8].")]
+Interval = Annotated[float | None, _option("interval-s", "SECONDS", "Time between frames [not stated].")]
+Focal = Annotated[float | None, _option("focal-px", "PX", "Focal length in pixels [plane 2727.27, cube 2800].")]
+Principal = Annotated[str | None, _option("principal-px", "X,Y", "Principal point in pixels [image centre].")]
+Baseline = Annotated[str | None, _option("baseline-mm", "X[,Y]", "Camera step in mm [plane 0.5, cube 5].")]
+Centre = Annotated[
+    str | None, _option("centre-mm", "X,Y", "Centre of the object at the middle frame, mm [plane 0,0, cube 18.3,0].")
+]
+Depth = Annotated[float | None, _option("depth-mm", "Z", "Depth of that centre, mm [plane 100, cube 1038.3].")]
+Velocity = Annotated[
+    str | None,
+    _option("velocity", "X,Y,Z", "Velocity of the rotation centre, mm/frame [plane .0073,-.0037,.06, cube -.2,0,-1]."),
+]
+Omega = Annotated[
+    str | None,
+    _option("omega-deg", "X,Y,Z", "Rotation, axis times degrees per frame [plane .003 about (2,3,2), cube 0,.4,0]."),
+]
+Pivot = Annotated[str | None, _option("rotation-centre-mm", "X,Y,Z", "Rotation centre, mm [centre of the object].")]
+Acceleration = Annotated[str | None, _option("acceleration", "X,Y,Z", "Acceleration of that point, mm/frame² [0,0,0].")]
+Offset = Annotated[float | None, _option("offset", "GREY", "Mean grey value, of 8 bits [plane 100, cube 120].")]
+
+
+@app.command("plane", no_args_is_help=False)
+def plane(
+    context: typer.Context,
+    folder: Folder,
+    cameras: Cameras = None,
+    rows: Rows = None,
+    frames: Frames = None,
+    size: Size = "301x301",
+    noise: Noise = None,
+    seed: Seed = None,
+    bits: Bits = "8",
+    interval_s: Interval = None,
+    focal_px: Focal = None,
+    principal_px: Principal = None,
+    baseline_mm: Baseline = None,
+    centre_mm: Centre = None,
+    depth_mm: Depth = None,
+    slope_x: Annotated[float | None, _option("slope-x", "ZX", "Slope dZ/dX [0.6].")] = None,
+    slope_y: Annotated[float | None, _option("slope-y", "ZY", "Slope dZ/dY [-0.5].")] = None,
+    velocity: Velocity = None,
+    omega_deg: Omega = None,
+    rotation_centre_mm: Pivot = None,
+    acceleration: Acceleration = None,
+    offset: Offset = None,
+    amplitude: Annotated[float | None, _option("amplitude", "GREY", "Amplitude of the texture [50].")] = None,
+    wavelength_mm: Annotated[
+        str | None, _option("wavelength-mm", "L1[,L2]", "Wavelengths of both cosines, mm [0.3].")
+    ] = None,
+    alpha_deg: Annotated[
+        float | None, _option("alpha-deg", "DEG", "Turns the texture, or its first cosine, in the plane [0].")
+    ] = None,
+    beta_deg: Annotated[float | None, _option("beta-deg", "DEG", "Turns the second cosine [as --alpha-deg].")] = None,
+    brightness: Annotated[
+        list[str] | None,
+        _option(
+            "brightness",
+            "AXIS,POWER,G[,GX,GY]",
+            "Term (G + GX X + GY Y) AXIS^POWER of the logarithm of the brightness: AXIS is t (frames), sx or sy (mm); "
+            "X, Y are mm from the centre. May be repeated.",
+        ),
+    ] = None,
+) -> None:
+    """A moving plane with a cosine texture; by default the sinusoid of Schuchert 2010, section 5.3."""
+    from leafflow_ti.synthetic.plane import sinusoid_scene
+
+    _write(sinusoid_scene(), context.params)
+
+
+@app.command("cube", no_args_is_help=False)
+def cube(
+    context: typer.Context,
+    folder: Folder,
+    cameras: Cameras = None,
+    rows: Rows = None,
+    frames: Frames = None,
+    size: Size = "301x301",
+    noise: Noise = None,
+    seed: Seed = None,
+    bits: Bits = "8",
+    interval_s: Interval = None,
+    focal_px: Focal = None,
+    principal_px: Principal = None,
+    baseline_mm: Baseline = None,
+    centre_mm: Centre = None,
+    depth_mm: Depth = None,
+    edges_mm: Annotated[str | None, _option("edges-mm", "X,Y,Z", "Edges of the box, mm [100,100,100].")] = None,
+    orientation_deg: Annotated[
+        str | None,
+        _option("orientation-deg", "X,Y,Z", "Turn of the box at the middle frame, axis times deg [0,-30,0]."),
+    ] = None,
+    velocity: Velocity = None,
+    omega_deg: Omega = None,
+    rotation_centre_mm: Pivot = None,
+    acceleration: Acceleration = None,
+    offset: Offset = None,
+    contrast: Annotated[float | None, _option("contrast", "GREY", "Standard deviation of the texture [27].")] = None,
+    background: Annotated[float | None, _option("background", "GREY", "Grey value beside the box [20].")] = None,
+    wavelength_mm: Annotated[
+        str | None, _option("wavelength-mm", "MIN,MAX", "Wavelengths of the texture, mm [2.2,8].")
+    ] = None,
+    texture_seed: Annotated[int | None, _option("texture-seed", "N", "Seed of the texture [1].")] = None,
+    supersampling: Annotated[int | None, _option("supersampling", "N", "Rays per pixel: N x N [4].")] = None,
+    light: Annotated[
+        str | None,
+        _option("light", "ambient|spot|spot-camera", "None but ambient, a fixed spot, one on the camera [ambient]."),
+    ] = None,
+    light_mm: Annotated[
+        str | None, _option("light-mm", "X,Y,Z", "Place of the spot (spot-camera: from the camera), mm [-150,-100,0].")
+    ] = None,
+    light_target_mm: Annotated[
+        str | None, _option("light-target-mm", "X,Y,Z", "What the spot is aimed at, likewise, mm [0,0,1000].")
+    ] = None,
+    light_cone_deg: Annotated[
+        float | None, _option("light-cone-deg", "DEG", "Standard deviation of the Gaussian cone of light [4].")
+    ] = None,
+    ambient_share: Annotated[
+        float | None, _option("ambient-share", "0..1", "Share of the light that has no direction [0.2].")
+    ] = None,
+) -> None:
+    """A textured box seen on an edge, turning; by default the cube of Schuchert 2010, section 5.3.2.
+
+    truth.npz labels its faces: 1 left, 2 right, 0 beside the box.
+    """
+    from leafflow_ti.synthetic.cube import CubeScene
+
+    _write(CubeScene(), context.params)
+
+
+def _write(default: Scene, params: Mapping[str, Any]) -> None:
+    """Write the scene ``default``, changed by the options that were given."""
+    from leafflow_ti.synthetic.write import write_scene
+
+    given = {name: value for name, value in params.items() if value not in (None, [], ())}
+    changes = {FIELDS[name][0]: FIELDS[name][1](_flag(name), given[name]) for name in given if name in FIELDS}
+    x, y, z = default.centre
+    if "centre_mm" in given:
+        x, y = _numbers(2)("--centre-mm", given["centre_mm"])
+    scene = replace(default, **changes, centre=(x, y, given.get("depth_mm", z)))
+    folder: Path = given["folder"]
+    write_scene(scene, folder, given.get("interval_s"), _show_progress if sys.stderr.isatty() else None)
+    typer.echo(
+        f"{folder}: {scene.n_frames} frames of {scene.n_rows} x {scene.n_cols} cameras (rows x columns), "
+        f"{scene.size[0]} x {scene.size[1]} px, {scene.bits or 'float'}{' bits' if scene.bits else ''}; "
+        f"capture.toml, truth.npz (frame {scene.reference_frame})"
+    )
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _show_progress(done: int, total: int) -> None:
+    sys.stderr.write(f"\rimage {done}/{total}" + ("\n" if done == total else ""))
+    sys.stderr.flush()

@@ -1,0 +1,50 @@
+"""The table of cases, and what each is given."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from perf.figures import Outcome
+
+
+@dataclass(frozen=True)
+class Options:
+    """``out``: folder for pictures. ``quick``: a smaller version of the case, for a first look and for tests."""
+
+    out: Path
+    quick: bool = False
+
+
+@dataclass(frozen=True)
+class Case:
+    """One command. ``home``: ``module:function`` inside this package; the function takes Options, returns an Outcome."""
+
+    name: str
+    home: str
+    summary: str
+
+    def load(self) -> Callable[[Options], Outcome]:
+        """The function, its module imported now: listing the cases starts nothing."""
+        module, _, function = self.home.partition(":")
+        found: Callable[[Options], Outcome] = getattr(importlib.import_module(f"perf.{module}"), function)
+        return found
+
+
+CASES = (
+    Case("table-3.1", "table31:run", "depth and slope of a sinusoidal plane, 1D and 2D grid, four orientations (Table 3.1)"),
+    Case("sinusoid", "sinusoid:run", "motion of a sinusoidal plane in 4D, with and without noise, error bars (section 5.3)"),
+    Case("cube", "cube:run", "rotating cube: motion, rotation and depth per face and set of rows (Table 5.1)"),
+    Case("hci-cotton", "cotton:run", "real 9x9 light field: disparity and normals of the whole image against its truth"),
+    Case("yosemite", "yosemite:run", "affine optical flow of the Yosemite sequence against its truth"),
+    Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
+    Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),
+    Case("stages", "stages:run", "microseconds per output pixel and stage, beside SciPy/NumPy; peak memory"),
+)
+
+
+def find(name: str) -> Case | None:
+    """The case of this name."""
+    return next((case for case in CASES if case.name == name), None)
