@@ -129,7 +129,7 @@ def evaluate(estimate: Maps, truth: Maps, regions: Mapping[str, Mask]) -> dict[s
 
     ``estimate``: maps [h, w] named as in the results store (``depth``, ``velocity_x``, ..., standard errors as
     ``NAME_std``). ``truth``: as from ``read_truth``, at the same pixels. ``regions``: name -> mask [h, w].
-    Slopes are compared as angles of inclination. Raises InputError if they have no quantity in common.
+    Slopes are compared as angles of inclination. Raises InputError if they have no quantity, or no pixel, in common.
     """
     pairs = list(_pairs(estimate, truth))
     if not pairs:
@@ -152,6 +152,10 @@ def evaluate(estimate: Maps, truth: Maps, regions: Mapping[str, Mask]) -> dict[s
             int(np.count_nonzero(inside)),
             {name: value for name, value in summaries.items() if value is not None},
             {name: value for name, value in coverages.items() if value is not None},
+        )
+    if not reports:
+        raise InputError(
+            f"no pixel of {', '.join(regions) or 'no region'} has truth: compare the frame and area it covers"
         )
     return reports
 

@@ -147,7 +147,7 @@ class Pipeline:
         return np.where(finite, block, 0), finite.all(axis=(0, 1))
 
     def _inside(self, band: Band, first_row: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Where every camera of the block sees its image, and where the mask allows a measurement: [in_rows, in_cols]."""
+        """Where every camera sees its image, and where the mask allows a measurement: [in_rows, in_cols]."""
         plan, capture = self.plan, self.capture
         y = plan.y[first_row] - band.halo_y + np.arange(band.in_rows)
         x = plan.x.start - band.halo_x + np.arange(band.in_cols)

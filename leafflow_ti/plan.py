@@ -229,7 +229,7 @@ def _series(
         size = min(5, longest)
     if int(size) > longest:
         raise ConfigError(
-            f"a window of {size} {what} with {2 * chosen.radius + 1} taps is too long, {usable} lie around the middle one: "
+            f"a window of {size} {what} with {2 * chosen.radius + 1} taps is too long, {usable} lie around the middle: "
             f"choose a window of at most {longest}, or fewer taps"
         )
     return AxisSampling.gaussian(chosen, int(size), sigma)

@@ -28,7 +28,7 @@ ADVICE: dict[Status, str] = {
     Status.APERTURE: "texture in one direction only: values along the other are uncertain, see the standard errors",
     Status.INCOHERENT: "the window's content does not move as one surface: shrink the window, or correct the preshift",
     Status.NOT_CONVERGED: "the solver found no isolated solution: use --precision f64 or a larger window",
-    Status.BORDER: "the window is not inside all images: a smaller window, or --border clip, measures closer to the edge",
+    Status.BORDER: "the window reaches beyond an image: a smaller one, or --border clip, measures closer to the edge",
     Status.MASKED: "outside the given mask",
     Status.NOT_FINITE: "the images hold NaN or infinite grey values here",
     Status.NOT_COMPUTED: "not computed yet, or outside the region of interest",

@@ -18,7 +18,7 @@ from leafflow_ti.plan import MOTION_NAMES
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import EstimateStage, Problem, View, unknowns_of
-from leafflow_ti.stages.tensor import Band, TensorStage
+from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, TensorStage
 from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
 
 GRIDS = {"single": (1, 1), "line-x": (1, 7), "line-y": (7, 1), "square": (5, 5)}
@@ -160,10 +160,10 @@ class Bench:
 
     @cached_property
     def planes(self) -> np.ndarray:
-        """Packed tensor and the planes behind it, float64 [n_entries + 3, rows, cols]."""
+        """Packed tensor and the planes behind it, float64 [n_entries + EXTRA_PLANES, rows, cols]."""
         stage, tensor = self._tensor
         shape = (-1, self.band.rows, stage.out_pitch)
-        n = (len(self.layout.entries) + 3) * shape[1] * shape[2]
+        n = (len(self.layout.entries) + EXTRA_PLANES) * shape[1] * shape[2]
         return np.array(self.device.host(tensor)[:n], np.float64).reshape(shape)[:, :, : self.band.cols]
 
     def tensor(self, row: int, col: int) -> np.ndarray:

@@ -15,6 +15,8 @@ import pytest
 import leafflow_ti as lf
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import RunConfig, load_config
+from leafflow_ti.progress import Progress
+from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import PlaneScene, render, truth
 
 SCENE = PlaneScene(
@@ -33,7 +35,13 @@ SCENE = PlaneScene(
     beta=1.0,
     noise=1.0,
 )
-OPTIONS: dict[str, object] = {"model": "affine-4d", "motion": "rotation", "preshift": (-3, 0), "window": 9, "sigma": 2.5}
+OPTIONS: dict[str, object] = {
+    "model": "affine-4d",
+    "motion": "rotation",
+    "preshift": (-3, 0),
+    "window": 9,
+    "sigma": 2.5,
+}
 
 
 def capture_of(scene: PlaneScene, **geometry: tuple[float, float]) -> Capture:
@@ -78,7 +86,7 @@ def test_tiled_equals_whole_with_stride_and_mask(capture: Capture, tmp_path: Pat
     mask.write_bytes(b"P5 61 43 255\n" + keep.tobytes())
     whole, tiled = (lf.estimate(capture, 6, **OPTIONS, stride=3, mask=mask, tile=tile) for tile in (15, 4))
     assert_same(whole, tiled)
-    assert (whole.status == lf.Status.MASKED).sum() == np.sum(keep[::3, ::3] == 0)
+    assert (whole.status == Status.MASKED).sum() == np.sum(keep[::3, ::3] == 0)
 
 
 @pytest.mark.parametrize("stride", [1, 3])
@@ -113,8 +121,8 @@ def test_resumed_run_ends_with_the_same_bytes(capture: Capture, tmp_path: Path, 
     """Nine units; the run dies in the middle of a band, or between bands."""
     wanted = config(frames="4:7", tile=16)
 
-    def die(progress: object) -> None:
-        if progress.done == stop_after:
+    def die(progress: Progress) -> None:
+        if progress.done_units == stop_after:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -160,7 +168,7 @@ def test_stated_disparity_offset_is_part_of_the_depth() -> None:
     images = np.concatenate([render(s, cameras=([row], [0])) for row, s in enumerate(sheared)], axis=1)
     geometry = Geometry(scene.f_px, scene.principal, (0.0, 0.3), (0.0, offset))
     field = lf.estimate(capture_from_array(images, geometry), model="depth", preshift=(0, -3), window=9, stride=2)
-    ok = field.status == lf.Status.OK
+    ok = field.status == Status.OK
     assert ok.sum() > 100
     depth = truth(scene)["depth"][::2, ::2]
     assert np.max(np.abs(field["depth"][ok] / depth[ok] - 1)) < 2e-3

@@ -11,7 +11,7 @@ import typer
 from leafflow_ti.cli.run import quicklook_folder
 from leafflow_ti.errors import UsageError
 
-SMALL: tuple[list[str], list[str]] = (["--size", "256x160"], ["--window", "41", "--stride", "2"])
+SMALL: tuple[list[str], list[str]] = (["--size", "400x260"], ["--window", "41", "--stride", "2"])
 FULL: tuple[list[str], list[str]] = (["--size", "301x301"], [])
 """Options of ``simulate cube`` and of ``run``; the full one has the window and image size of the dissertation."""
 

@@ -85,7 +85,8 @@ def _brightness(option: str, texts: list[str]) -> tuple[Any, ...]:
         power, _, coefficients = rest.partition(",")
         if axis not in ("t", "sx", "sy") or not power.isdecimal():
             raise UsageError(f"{option} {text}: must be AXIS,POWER,G[,GX,GY] with AXIS t, sx or sy, e.g. t,1,0.01")
-        terms.append(BrightnessTerm(axis, int(power), *_numbers(1, 3)(option, coefficients)))  # type: ignore[arg-type]
+        g = _numbers(1, 3)(f"{option} {axis},{power},", coefficients)
+        terms.append(BrightnessTerm(axis, int(power), *g))  # type: ignore[arg-type]
     return tuple(terms)
 
 
@@ -162,7 +163,7 @@ Acceleration = Annotated[str | None, _option("acceleration", "X,Y,Z", "Accelerat
 Offset = Annotated[float | None, _option("offset", "GREY", "Mean grey value, of 8 bits [plane 100, cube 120].")]
 
 
-@app.command("plane", no_args_is_help=False)
+@app.command("plane", short_help="A moving plane with a cosine texture.", no_args_is_help=False)
 def plane(
     context: typer.Context,
     folder: Folder,
@@ -210,7 +211,7 @@ def plane(
     _write(sinusoid_scene(), context.params)
 
 
-@app.command("cube", no_args_is_help=False)
+@app.command("cube", short_help="A textured box that turns and moves.", no_args_is_help=False)
 def cube(
     context: typer.Context,
     folder: Folder,

@@ -189,7 +189,7 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Least squares of (nu, b_x, b_y, b_t) per mm over all camera solutions: (3.40), with normals and error bars."""
+        """Least squares of (nu, b_x, b_y, b_t) per mm over all camera solutions: (3.40), with normals."""
         terms, rows_t = number[Number.TERMS], number[Number.ROWS_T]
         first = base + number[Region.GEOMETRY_NORMAL] * stride
         for e in range(number[Region.GEOMETRY_COV] - number[Region.GEOMETRY_NORMAL]):

@@ -3,8 +3,8 @@
 Element ``e`` of group ``g`` and lane ``i`` is ``ws[base + e * stride + i]``. On the CPU ``base = g n_elements
 lanes`` and ``stride = lanes``; on a GPU, with one lane, ``base = g`` and ``stride = n_groups``, so that
 neighbouring threads read neighbouring words. A lower triangle is packed by rows: element (r, c) at
-``r (r + 1) / 2 + c``. Values are loaded into a local vector first and stored in a loop of their own: a loop that does both on one
-array is not vectorised.
+``r (r + 1) / 2 + c``. Values are loaded into a local vector first and stored in a loop of their own: a loop that
+does both on one array is not vectorised.
 """
 
 import functools

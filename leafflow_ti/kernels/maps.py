@@ -53,6 +53,7 @@ def maps_kernel(spec: KernelSpec):
         xy = ti.cast(J[number[Number.LOWER + tri(iy, ix)] * n_pixels + at], precise)
         yy = ti.cast(J[number[Number.LOWER + tri(iy, iy)] * n_pixels + at], precise)
         mass = ti.cast(J[number[Number.EXTRA] * n_pixels + at], precise)
+        level = ti.cast(J[(number[Number.EXTRA] + 3) * n_pixels + at], precise)
         noise = precise(0.0)
         energy = precise(0.0)
         for j in range(number[Number.SOLUTIONS]):
@@ -65,7 +66,7 @@ def maps_kernel(spec: KernelSpec):
         result = ti.cast(ok, ti.i32)
         if mass < value[Value.MIN_MASS]:
             result = border
-        elif not (half > precise(1e-12) * mass and half > 2 * noise * gain):
+        elif not (half > value[Value.MIN_STRUCTURE] * level and half > 2 * noise * gain):
             result = no_structure
         elif not (energy < value[Value.MAX_RESIDUAL] * value[Value.MAX_RESIDUAL] * 2 * half):
             result = incoherent

@@ -162,7 +162,7 @@ class Number(IntEnum):
     OUT_Y = auto()
     STEP = auto()
     PITCH = auto()
-    EXTRA = auto()  # first J plane behind the tensor: window mass, gradient energy, smoothed energy
+    EXTRA = auto()  # first J plane behind the tensor: window mass, energies
     FLOW_ROWS = auto()  # 2: columns of the motion itself
     OFFSET_CODES = FLOW_ROWS + 2  # 6: offset of each motion row: 0 = "1", 1.. = AXES
     MOTION_ROWS = OFFSET_CODES + 6  # MAX_ROWS: columns of the motion rows
@@ -185,6 +185,7 @@ class Value(IntEnum):
     RANGE_CAUTION = auto()  # factor of the standard error of b_t in the weights
     GAIN = auto()  # noise gain of the gradient: x and y
     MIN_MASS = auto()
+    MIN_STRUCTURE = auto()  # least gradient energy per energy of the image
     MAX_RESIDUAL = auto()  # px, for status incoherent
     GAP = auto()  # convergence: residual per gap
     SCALE = auto()  # MAX_COLUMNS

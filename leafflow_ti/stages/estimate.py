@@ -27,6 +27,8 @@ without any noise), and ``a_s`` measures the same mixed derivative from the same
 overrate it.
 """
 STEP_SIZE = {"f64": 1e-4, "f32": 1e-2}
+MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
+"""Least energy of the gradient relative to that of the image, (8 eps)²: below, it is the rounding of a constant."""
 MIN_MASS = 0.2
 """Least share of the window's weight that must lie inside the images (a corner pixel has 1/4)."""
 MAX_RESIDUAL_PX = 0.5
@@ -170,6 +172,7 @@ class EstimateStage:
         value[Value.NOISE : Value.NOISE + columns.n] = noise
         value[Value.GAIN] = noise_gain(sampling, "x")
         value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
+        value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
         value[Value.RANGE_CAUTION] = RANGE_CAUTION
         lower = np.tril_indices(columns.n_flow)
         ratios = [noise_ratio(sampling, columns, a)[lower] for a in columns.solutions]

@@ -20,12 +20,12 @@ from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
 
-EXTRA_PLANES = 3
-"""Planes behind the tensor's entries: window mass, gradient energy, energy of the gradient smoothed once more."""
+EXTRA_PLANES = 4
+"""Behind the tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
 OUTPUT_PLANES = 37
 _CAMERA = ("sy", "sx")
 _PASSES = ("t", "sy", "sx", "y", "x")
-_MASS, _ENERGY, _SMOOTH = ((name, (0, 0)) for name in ("mass", "energy", "smooth"))
+_MASS, _ENERGY, _SMOOTH, _LEVEL = ((name, (0, 0)) for name in ("mass", "energy", "smooth", "level"))
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Band:
 
 @dataclass
 class Terms:
-    """A sparse table: for each output plane, a list of (source, weight); ``source`` is an offset or a pair of planes."""
+    """A sparse table: for each output plane, a list of (offset or pair of planes, weight)."""
 
     first: list[int]
     source: list[Any]
@@ -164,6 +164,7 @@ class TensorStage:
     def reset(self) -> None:
         """Forget all frames: the next one pushed starts a new window."""
         self._valid: deque[NDArray[np.bool_]] = deque(maxlen=self.n_taps)
+        self._reference: deque[NDArray[Any]] = deque(maxlen=self.n_taps)
         self._pushed = 0
         self._n_maps = 0
 
@@ -226,7 +227,7 @@ class TensorStage:
         return outputs
 
     def _plan_smoothness(self) -> None:
-        """The reference camera's gradient smoothed once more, and a plane of ones, lie behind the channels.
+        """The reference camera's smoothed gradient, a plane of ones, and its grey values lie behind the channels.
 
         The smoothed planes are displaced by the filter radius: their window sums start that much earlier.
         """
@@ -242,7 +243,7 @@ class TensorStage:
 
         self._smoothing = (smooth(self._gradient, "y", self.pitch), smooth([0, 1], "x", 1))
         n = len(self._channels)
-        self._sources = self.device.array(np.ones((n + 3) * self._plane_size + self._slack))
+        self._sources = self.device.array(np.ones((n + 4) * self._plane_size + self._slack))
 
     def _plan_products(self, layout: TensorLayout) -> None:
         """This frame's maps: products summed over camera samples, for each power of the camera offsets."""
@@ -267,6 +268,7 @@ class TensorStage:
         outputs[_ENERGY] = [((g, g), 1.0) for g in self._gradient]
         outputs[_SMOOTH] = [((n + k, n + k), 1.0) for k in range(2)]
         outputs[_MASS] = [((n + 2, n + 2), 1.0)]
+        outputs[_LEVEL] = [((n + 3, n + 3), 1.0)]
         terms_table = Terms.of(list(outputs.values()))
         self._map_index = {key: i for i, key in enumerate(outputs)}
         self._product_tables = (
@@ -295,7 +297,7 @@ class TensorStage:
             e = entry.exponents
             powers = (e[AXES.index("sy")], e[AXES.index("sx")])
             add((entry.channels, powers), e[t], e[y], e[x])
-        for extra in (_MASS, _ENERGY, _SMOOTH):
+        for extra in (_MASS, _ENERGY, _SMOOTH, _LEVEL):
             add(extra, 0, 0, 0)
         n_t = sampling.t.size
         self._sums = []
@@ -352,6 +354,7 @@ class TensorStage:
         frame[..., : self.band.in_cols] = block
         self.device.write(self._raw, self._pushed % self.n_taps * self._frame_size, frame)
         self._valid.append(valid)
+        self._reference.append(frame[self.cameras[0] // 2, self.cameras[1] // 2].copy())
         self._pushed += 1
         if self._pushed < self.n_taps:
             return None
@@ -375,6 +378,7 @@ class TensorStage:
         along_y, along_x = self._smoothing
         along_y(self._sources, self._scratch[0])
         along_x(self._scratch[0], self._sources, len(self._channels) * self._plane_size)
+        device.write(self._sources, (len(self._channels) + 3) * self._plane_size, self._grey_values())
         slot = self._n_maps % self.sampling.t.size
         sum_products_kernel(device.planes)(
             len(self._map_index), self._plane_size, slot * self._slot_size,
@@ -382,6 +386,12 @@ class TensorStage:
             *self._product_tables, device.array(self._mask()), self._sources, self._maps,
         )  # fmt: skip
         self._n_maps += 1
+
+    def _grey_values(self) -> NDArray[Any]:
+        """The reference camera's image where the channels are: [map_rows, pitch]."""
+        ry, rx = self.sampling.y.filter_radius, self.sampling.x.filter_radius
+        image = self._reference[self.n_taps // 2][ry : ry + self.map_rows, rx:]
+        return np.pad(image, ((0, 0), (0, rx)))
 
     def _mask(self) -> NDArray[Any]:
         """Where the filters see valid pixels only: [map_rows, pitch]."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,32 +30,41 @@ def write_scene(
     interval_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Render ``scene`` into a new or empty ``folder``.
+    """Render ``scene`` into a new or empty ``folder``, which appears under its name only when it is whole.
 
     Images are uint8 or uint16 (10, 12 and 14 bits lie in 16), or float32 for ``bits`` None. ``truth.npz`` holds the
     maps of ``truth``, the index ``frame`` they belong to, ``f_px``, ``baseline_mm`` and ``principal``.
     ``interval_s`` [s] is the time between frames; ``progress`` is called with the number of images done and of all.
-    ``capture.toml`` comes last: a folder without it is not whole.
     Raises UsageError if the folder holds anything, or as rendering does; RunError if it cannot be written.
     """
     if interval_s is not None and not 0.0 < interval_s < float("inf"):
-        raise UsageError(f"interval = {interval_s:g} s: must be positive")
+        raise UsageError(f"interval = {interval_s:g} s: must be positive and finite")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty: remove it, or name another folder")
-    pattern = image_pattern(scene)
-    images = [(t, sy, sx) for t in range(scene.n_frames) for sy in range(scene.n_rows) for sx in range(scene.n_cols)]
+    scratch = folder.absolute().with_name(f".{folder.absolute().name}.{os.getpid()}")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for done, (t, sy, sx) in enumerate(images, start=1):
-            path = folder / pattern.format(t=t, sy=sy, sx=sx)
-            path.parent.mkdir(exist_ok=True)
-            tifffile.imwrite(path, _stored(scene, _image(scene, t, sy, sx)))
-            if progress is not None:
-                progress(done, len(images))
-        np.savez_compressed(folder / TRUTH_FILE, **truth_arrays(scene))
-        (folder / CAPTURE_FILE).write_text(capture_text(scene, interval_s), encoding="utf-8")
+        scratch.mkdir(parents=True)
+        _write_images(scene, scratch, progress)
+        np.savez_compressed(scratch / TRUTH_FILE, **truth_arrays(scene))
+        (scratch / CAPTURE_FILE).write_text(capture_text(scene, interval_s), encoding="utf-8")
+        if folder.exists():
+            folder.rmdir()
+        scratch.rename(folder)
     except OSError as error:
         raise RunError(f"{folder}: cannot be written ({error.strerror or error}): choose another folder") from error
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _write_images(scene: Scene, folder: Path, progress: Callable[[int, int], None] | None) -> None:
+    pattern = image_pattern(scene)
+    images = [(t, sy, sx) for t in range(scene.n_frames) for sy in range(scene.n_rows) for sx in range(scene.n_cols)]
+    for done, (t, sy, sx) in enumerate(images, start=1):
+        path = folder / pattern.format(t=t, sy=sy, sx=sx)
+        path.parent.mkdir(exist_ok=True)
+        tifffile.imwrite(path, _stored(scene, _image(scene, t, sy, sx)))
+        if progress is not None:
+            progress(done, len(images))
 
 
 def image_pattern(scene: Scene) -> str:

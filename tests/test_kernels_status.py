@@ -1,0 +1,154 @@
+"""Inputs at the edge: every pixel says why it has no value, and bad pixels reach no further than their windows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import leafflow_ti as lf
+from leafflow_ti.capture import Geometry, capture_from_array
+from leafflow_ti.status import HAS_VALUE, Status
+from leafflow_ti.synthetic.plane import PlaneScene, render
+
+SCENE = PlaneScene(
+    f_px=900.0,
+    baseline_mm=(0.3, 0.3),
+    n_cols=5,
+    n_frames=7,
+    size=(64, 44),
+    centre=(0.3, -0.2, 80.0),
+    zx=0.2,
+    zy=-0.1,
+    velocity=(0.021, -0.014, 0.06),
+    wavelengths_mm=(0.6, 0.75),
+    alpha=0.4,
+    beta=1.0,
+    noise=1.0,
+)
+RADIUS = 4 + 2  # of the window and of the filters
+MODELS = ["flow", "flow-affine", "affine-4d"]
+ESTIMATORS = ["ols", "tls", "tls-equilibrated"]
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    return render(SCENE)
+
+
+def measure(images: np.ndarray, model: str = "affine-4d", **options: object) -> lf.Field:
+    if model.startswith("flow"):
+        images = images[:, :, 2:3]
+    else:
+        options = {"motion": "rotation", "preshift": (-3, 0), **options}
+    capture = capture_from_array(images, Geometry(SCENE.f_px, SCENE.principal, SCENE.baseline_mm))
+    return lf.estimate(capture, model=model, **{"window": 9, "sigma": 2.5, "stride": 1, **options})
+
+
+def statuses(field: lf.Field) -> set[Status]:
+    """Codes that occur away from the border."""
+    return {Status(int(code)) for code in np.unique(field.status)} - {Status.BORDER}
+
+
+def assert_values_follow_status(field: lf.Field) -> None:
+    empty = ~np.isin(field.status, HAS_VALUE)
+    for name, values in field.items():
+        np.testing.assert_array_equal(np.isnan(values), empty, err_msg=name)
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("grey", [0.0, 1e-3, 107.3, 65535.0])
+def test_constant_images_have_no_structure(
+    images: np.ndarray, grey: float, model: str, estimator: str, precision: str
+) -> None:
+    field = measure(np.full_like(images, grey), model, estimator=estimator, precision=precision)
+    assert statuses(field) == {Status.NO_STRUCTURE}
+    assert_values_follow_status(field)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("model", MODELS)
+def test_pure_noise_has_no_value(images: np.ndarray, model: str, estimator: str) -> None:
+    noise = np.random.default_rng(0).normal(100, 5, images.shape)
+    field = measure(noise, model, estimator=estimator)
+    assert statuses(field) <= {Status.NO_STRUCTURE, Status.INCOHERENT, Status.NOT_CONVERGED}
+    assert_values_follow_status(field)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_content_that_jumps_is_incoherent(images: np.ndarray, model: str) -> None:
+    """Smooth texture that has nothing to do with that of the frame before: much structure, no motion explains it."""
+    jumping = np.stack([np.roll(frame, (7 * t * t, 11 * t * t), (-2, -1)) for t, frame in enumerate(images)])
+    assert Status.OK not in statuses(measure(jumping, model))
+    assert Status.INCOHERENT in statuses(measure(jumping, model))
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_one_dimensional_texture_is_an_aperture_problem(model: str, noise: float) -> None:
+    stripes = render(replace(SCENE, wavelengths_mm=(0.6, 1e9), noise=noise))
+    field = measure(stripes, model, solver="jacobi")
+    assert statuses(field) == {Status.APERTURE}
+    assert_values_follow_status(field)
+    if noise and model == "flow":
+        # Along the stripes nothing is known, and the standard errors say so; across them they are as good as ever.
+        known = measure(render(SCENE), model)["flow_x_std"]
+        assert np.nanmedian(field["flow_x_std"]) > 10 * np.nanmedian(known)
+
+
+def test_full_texture_is_ok(images: np.ndarray) -> None:
+    """What the other tests spoil."""
+    for model in MODELS:
+        field = measure(images, model)
+        assert statuses(field) == {Status.OK}
+        assert_values_follow_status(field)
+
+
+def test_preshift_out_of_the_image_is_border(images: np.ndarray) -> None:
+    """The border is as wide as window, filters and the shift of the outermost camera; everything, for large shifts."""
+    border = measure(images).status == Status.BORDER
+    rows, cols = (np.flatnonzero(~border.all(axis=axis)) for axis in (1, 0))
+    height, width = border.shape
+    assert (rows[0], height - 1 - rows[-1]) == (RADIUS, RADIUS)
+    assert (cols[0], width - 1 - cols[-1]) == (RADIUS + 6, RADIUS + 6)
+    assert not border[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1].any()
+    assert statuses(measure(images, preshift=(-40, 0))) == set()
+
+
+def test_pixels_that_are_not_finite_stay_in_their_windows(images: np.ndarray) -> None:
+    whole = measure(images)
+    broken = images.copy()
+    broken[3, 0, 2, 20, 30] = np.nan
+    broken[2, 0, 2, 21, 34] = np.inf
+    field = measure(broken)
+    assert np.argwhere(field.status == Status.NOT_FINITE).tolist() == [[20, 30]]
+    assert field.status[21, 34] == Status.OK  # finite at the frame that is measured
+    assert_values_follow_status(field)
+    # The standard errors look at the gradient smoothed once more: one filter radius further.
+    near = np.zeros(field.shape, bool)
+    near[20 - RADIUS - 2 : 21 + RADIUS + 3, 30 - RADIUS - 2 : 34 + RADIUS + 3] = True
+    for name in whole:
+        np.testing.assert_array_equal(field[name][~near], whole[name][~near], err_msg=name)
+    with np.errstate(invalid="ignore"):
+        difference = np.abs(field["depth"] - whole["depth"]) / whole["depth_std"]
+    assert 0 < np.nanmax(difference) < 5
+
+
+def test_masked_pixels_have_no_influence(images: np.ndarray, tmp_path: Path) -> None:
+    keep = np.full(images.shape[-2:], 255, np.uint8)
+    keep[18:26, 24:40] = 0
+    (tmp_path / "mask.pgm").write_bytes(b"P5 64 44 255\n" + keep.tobytes())
+    field = measure(images, mask=tmp_path / "mask.pgm")
+    np.testing.assert_array_equal((field.status == Status.MASKED)[keep == 0], True)
+    np.testing.assert_array_equal((field.status == Status.MASKED)[keep != 0], False)
+    assert_values_follow_status(field)
+    spoiled = images.copy()
+    spoiled[..., keep == 0] = 1e4
+    other = measure(spoiled, mask=tmp_path / "mask.pgm")
+    np.testing.assert_array_equal(field.status, other.status)
+    for name in ("depth", "slope_x", "flow_x"):
+        np.testing.assert_array_equal(field[name], other[name], err_msg=name)
