@@ -196,9 +196,10 @@ def read_truth(path: str | Path) -> dict[str, NDArray[Any]]:
     """
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened as what it must be: np.load would also take a lone array or try a pickle.
+        with path.open("rb") as stream, np.lib.npyio.NpzFile(stream, allow_pickle=False) as archive:
             truth = {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile, AttributeError) as error:
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: no readable truth.npz ({' '.join(str(error).split())})") from error
     if not any(key in truth for key in TRUTH_MAPS):
         raise InputError(f"{path}: holds {', '.join(truth) or 'nothing'}, but none of {', '.join(TRUTH_MAPS)}")

@@ -44,6 +44,7 @@ class Settings:
     sigma_camera: float = 2.0
     estimator: str = "tls-equilibrated"
     solver: str = "jacobi"
+    border: str = "clip"
     stride: int = 1
     roi: tuple[int, int, int, int] = (0, 0, SIZE_PX, SIZE_PX)
     preshifts_px: tuple[int, ...] = (-1, 0, 1)
@@ -88,7 +89,8 @@ def estimate_cotton(capture: FileCapture, settings: Settings, preshift_px: int =
 
     return estimate(
         capture, frame=0, model="depth", preshift=(preshift_px, preshift_px), window=settings.window, stride=settings.stride,
-        sigma_camera=settings.sigma_camera, estimator=settings.estimator, solver=settings.solver, roi=settings.roi,
+        sigma_camera=settings.sigma_camera, estimator=settings.estimator, solver=settings.solver, border=settings.border,
+        roi=settings.roi,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from leafflow_ti.capture import Geometry, capture_from_array
 from leafflow_ti.field import Field
-from leafflow_ti.metrics import Mask, aae, erode
+from leafflow_ti.metrics import aae, erode
 from leafflow_ti.synthetic import cube
 from perf.cases import Options
 from perf.fields import vectors
@@ -68,9 +68,8 @@ def measure(settings: Settings, out: Path) -> Outcome:
             "Omega": aae(vectors(field, "rotation"), true["omega"]),
             "depth": np.abs(field["depth"] - true["depth"][there]),
         }
-        inside = _seen_whole(scene, settings)
         for face, side in FACES.items():
-            kept = erode(true["face"] == face, settings.margin_px)[there] & inside[there] & np.isfinite(errors["N"])
+            kept = erode(true["face"] == face, settings.margin_px)[there] & np.isfinite(errors["N"])
             figures += _figures(rows, side, {name: values[kept] for name, values in errors.items()}, rows == settings.rows[0])
         if rows == settings.rows[-1]:
             pictures.append(_picture(out / "cube.png", field, errors))
@@ -79,15 +78,6 @@ def measure(settings: Settings, out: Path) -> Outcome:
         "Scene Flow .36 ± .09 / .12 ± .04; Omega .017 ± .01 / .004 ± .01",
     )
     return Outcome(tuple(figures), asdict(settings), notes, tuple(pictures))
-
-
-def _seen_whole(scene: cube.CubeScene, settings: Settings) -> Mask:
-    """Pixels [H, W] whose window lies inside every preshifted image."""
-    width, height = scene.size
-    border = scene.n_cols // 2 * abs(settings.preshift_px)
-    mask = np.zeros((height, width), bool)
-    mask[:, border : width - border] = True
-    return erode(mask, settings.window // 2 + 2)
 
 
 def _figures(rows: str, side: str, errors: dict[str, np.ndarray], with_depth: bool) -> list[Figure]:

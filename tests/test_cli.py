@@ -442,7 +442,7 @@ def test_info_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 # --- demo ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("flags", "size"), [([], "256x160"), (["--full"], "301x301")])
+@pytest.mark.parametrize(("flags", "size"), [([], "400x260"), (["--full"], "301x301")])
 def test_demo_prints_what_it_does(
     flags: list[str], size: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -225,7 +225,7 @@ def test_plane_must_show_its_front() -> None:
     with pytest.raises(UsageError, match="edge-on or from behind"):
         render(replace(SCENE, zx=120.0))
     with pytest.raises(UsageError, match="t = 2 frames"):
-        render(replace(SCENE, omega=(0.0, 1.0, 0.0), rotation_centre=None), frames=[4])
+        render(replace(SCENE, omega=(0.0, -1.0, 0.0), rotation_centre=None), frames=[4])
     with pytest.raises(UsageError, match="frame 5 does not exist"):
         render(SCENE, frames=[5])
     with pytest.raises(UsageError, match="camera row -1"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +39,7 @@ def closed_form(scene: PlaneScene, x: float, y: float) -> dict[str, np.ndarray]:
     return predict(x, y, scene.f_px, float(point[2]), scene.zx, scene.zy, N, scene.omega, A)
 
 
-def assert_equal_parameters(found: dict, wanted: dict, rel: float) -> None:
+def assert_equal_parameters(found: Mapping[str, Any], wanted: Mapping[str, Any], rel: float) -> None:
     """Entry by entry; the absolute floor only serves entries that nearly vanish."""
     for name, value in wanted.items():
         np.testing.assert_allclose(found[name], value, rtol=rel, atol=1e-3 * rel * np.abs(value).max(), err_msg=name)

@@ -118,7 +118,6 @@ def _frame_index(store: ResultStore, truth: Mapping[str, Any], frame: int | None
             return 0
         raise UsageError(f"{path} does not say its frame, the results hold {len(store.frames)}: give --frame T")
     if frame not in store.frames:
-        raise InputError(
-            f"{store.path}: holds frames {store.frames[0]}..{store.frames[-1]}, not {frame}: run that one, or give --frame"
-        )
+        held = f"{store.frames[0]}..{store.frames[-1]}"
+        raise InputError(f"{store.path}: holds frames {held}, not {frame}: run that one, or give --frame")
     return store.frames.index(frame)

@@ -288,6 +288,11 @@ def _write(default: Scene, params: Mapping[str, Any]) -> None:
         f"{scene.size[0]} x {scene.size[1]} px, {scene.bits or 'float'}{' bits' if scene.bits else ''}; "
         f"capture.toml, truth.npz (frame {scene.reference_frame})"
     )
+    counts = (scene.n_cols, scene.n_rows)
+    shift = [round(-scene.f_px * b / scene.centre[2]) * (n > 1) for b, n in zip(scene.baseline_mm, counts, strict=True)]
+    if any(shift):
+        # Periodic textures hide it from a search.
+        typer.echo(f"disparity at the centre in whole pixels: --preshift {shift[0]},{shift[1]}")
 
 
 def _flag(name: str) -> str:

@@ -1,0 +1,219 @@
+"""Scenes as files, and the command ``simulate``."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from leafflow_ti.capture import open_capture
+from leafflow_ti.cli.main import main
+from leafflow_ti.errors import RunError, UsageError
+from leafflow_ti.metrics import read_truth
+from leafflow_ti.synthetic import cube, plane
+from leafflow_ti.synthetic.cube import CubeScene
+from leafflow_ti.synthetic.plane import PlaneScene, sinusoid_scene
+from leafflow_ti.synthetic.write import image_pattern, write_scene
+
+SCENE = replace(sinusoid_scene(noise=1.0, size=(12, 8)), n_cols=3, n_frames=2, principal_px=(5.0, 4.25))
+
+
+def command(*args: object) -> int:
+    """Exit code of one command line."""
+    with pytest.raises(SystemExit) as end:
+        main([str(arg) for arg in args])
+    code = end.value.code
+    return code if isinstance(code, int) else 0
+
+
+@pytest.mark.parametrize(
+    ("grid", "pattern"),
+    [
+        ((1, 3, 2), "cam_{sx:02d}/frame_{t:03d}.tif"),
+        ((3, 1, 2), "cam_{sy:02d}/frame_{t:03d}.tif"),
+        ((2, 3, 2), "cam_{sy:02d}_{sx:02d}/frame_{t:03d}.tif"),
+        ((1, 3, 1), "cam_{sx:02d}.tif"),
+        ((1, 1, 2), "frame_{t:03d}.tif"),
+        ((1, 1, 1), "image.tif"),
+    ],
+)
+def test_every_grid_is_a_capture(grid: tuple[int, int, int], pattern: str, tmp_path: Path) -> None:
+    rows, cols, frames = grid
+    scene = replace(SCENE, n_rows=rows, n_cols=cols, n_frames=frames, bits=8)
+    assert image_pattern(scene) == pattern
+    write_scene(scene, tmp_path / "scene", interval_s=60.0)
+    capture = open_capture(tmp_path / "scene")
+    assert capture.shape == (frames, rows, cols, 8, 12)
+    images = plane.render(scene)
+    for t in range(frames):
+        for sy in range(rows):
+            for sx in range(cols):
+                np.testing.assert_array_equal(capture.read(t, sy, sx, 0, 8, 0, 12), images[t, sy, sx])
+    assert capture.frame_interval_s == 60.0
+    assert capture.geometry is not None
+    assert capture.geometry.f_px == scene.f_px
+    assert capture.geometry.principal_px == (5.0, 4.25)
+    assert capture.geometry.baseline_mm == (0.5 if cols > 1 else 0.0, 0.5 if rows > 1 else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("bits", "dtype"),
+    [(8, "uint8"), (10, "uint16"), (12, "uint16"), (14, "uint16"), (16, "uint16"), (None, "float32")],
+)
+def test_bit_depths(bits: int | None, dtype: str, tmp_path: Path) -> None:
+    scene = replace(SCENE, bits=bits)
+    write_scene(scene, tmp_path)
+    stored = tifffile.imread(tmp_path / "cam_02" / "frame_001.tif")
+    assert stored.dtype == dtype
+    np.testing.assert_array_equal(stored, plane.render_image(scene, 1, 0, 2).astype(dtype))
+    images = tomllib.loads((tmp_path / "capture.toml").read_text())["images"]
+    assert images.get("bit_depth") == (bits if bits in (10, 12, 14) else None)
+
+
+@pytest.mark.parametrize("scene", [SCENE, CubeScene(size=(40, 30), f_px=300.0, n_frames=1, n_cols=2)])
+def test_truth_round_trip(scene: PlaneScene | CubeScene, tmp_path: Path) -> None:
+    write_scene(scene, tmp_path / "new" / "scene")
+    with np.load(tmp_path / "new" / "scene" / "truth.npz") as archive:
+        stored = dict(archive)
+    wanted = plane.truth(scene) if isinstance(scene, PlaneScene) else cube.truth(scene)
+    for key, value in wanted.items():
+        np.testing.assert_array_equal(stored[key], value)
+    assert stored["frame"] == scene.n_frames // 2
+    assert stored["f_px"] == scene.f_px
+    np.testing.assert_array_equal(stored["baseline_mm"], scene.baseline_mm)
+    np.testing.assert_array_equal(stored["principal"], scene.principal)
+    assert read_truth(tmp_path / "new" / "scene" / "truth.npz")["omega"].shape == (*wanted["depth"].shape, 3)
+
+
+def test_nothing_is_left_of_a_scene_that_fails(tmp_path: Path) -> None:
+    turning = replace(SCENE, omega=(0.0, 1.0, 0.0), n_frames=5)
+    with pytest.raises(UsageError, match="from behind"):
+        write_scene(turning, tmp_path / "scene")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writing_refuses(tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("x")
+    with pytest.raises(UsageError, match="not empty"):
+        write_scene(SCENE, tmp_path)
+    with pytest.raises(UsageError, match="interval = 0 s"):
+        write_scene(SCENE, tmp_path / "scene", interval_s=0.0)
+    with pytest.raises(RunError, match="cannot be written"):
+        write_scene(SCENE, tmp_path / "precious.txt" / "scene")
+
+
+# --- simulate --------------------------------------------------------------------------------------------------------
+
+
+def read_images(folder: Path, frames: int, cols: int) -> np.ndarray:
+    return np.array(
+        [
+            [tifffile.imread(folder / f"cam_{sx:02d}" / f"frame_{t:03d}.tif") for sx in range(cols)]
+            for t in range(frames)
+        ]
+    )
+
+
+def test_simulate_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "p"
+    options = (
+        "--cameras 3 --rows 1 --frames 2 --size 12x8 --noise 1.5 --seed 4 --bits 12 --interval-s 30 --focal-px 700 "
+        "--principal-px 5,4 --baseline-mm .7,.8 --centre-mm 1,2 --depth-mm 90 --slope-x -.3 --slope-y .2 "
+        "--velocity -.1,.2,.3 --omega-deg .1,-.2,.3 --rotation-centre-mm 1,2,3 --acceleration .01,0,-.02 "
+        "--offset 120 --amplitude 30 --wavelength-mm 2 --alpha-deg 30 --beta-deg 45 --brightness t,1,.01 "
+        "--brightness sx,2,.02,.03,.04"
+    )
+    assert command("simulate", "plane", out, *options.split()) == 0
+    assert "2 frames of 1 x 3 cameras" in capsys.readouterr().out
+    scene = PlaneScene(
+        f_px=700.0,
+        baseline_mm=(0.7, 0.8),
+        n_cols=3,
+        n_frames=2,
+        size=(12, 8),
+        principal_px=(5.0, 4.0),
+        noise=1.5,
+        seed=4,
+        bits=12,
+        centre=(1.0, 2.0, 90.0),
+        zx=-0.3,
+        zy=0.2,
+        velocity=(-0.1, 0.2, 0.3),
+        omega=tuple(np.radians((0.1, -0.2, 0.3)).tolist()),
+        rotation_centre=(1.0, 2.0, 3.0),
+        acceleration=(0.01, 0.0, -0.02),
+        offset=120.0,
+        amplitude=30.0,
+        wavelengths_mm=(2.0, 2.0),
+        alpha=np.pi / 6,
+        beta=np.pi / 4,
+        brightness=(plane.BrightnessTerm("t", 1, 0.01), plane.BrightnessTerm("sx", 2, 0.02, 0.03, 0.04)),
+    )
+    np.testing.assert_array_equal(read_images(out, 2, 3), plane.render(scene)[:, 0])
+    np.testing.assert_allclose(np.load(out / "truth.npz")["velocity"], plane.truth(scene)["velocity"], rtol=1e-12)
+
+
+def test_simulate_cube(tmp_path: Path) -> None:
+    out = tmp_path / "c"
+    options = (
+        "--cameras 2 --frames 1 --size 40x30 --focal-px 300 --baseline-mm 6 --edges-mm 90,80,70 "
+        "--orientation-deg 0,-40,0 --depth-mm 1100 --contrast 20 --background 9 --wavelength-mm 9,40 "
+        "--texture-seed 3 --supersampling 2 --light spot --light-mm 10,20,30 "
+        "--light-target-mm 1,2,900 --light-cone-deg 6 --ambient-share .4 --bits float --rows 1"
+    )
+    assert command("simulate", "cube", out, *options.split()) == 0
+    scene = CubeScene(
+        n_cols=2,
+        n_frames=1,
+        size=(40, 30),
+        f_px=300.0,
+        baseline_mm=(6.0, 6.0),
+        bits=None,
+        centre=(18.3, 0.0, 1100.0),
+        edges_mm=(90.0, 80.0, 70.0),
+        orientation=(0.0, np.radians(-40.0), 0.0),
+        contrast=20.0,
+        background=9.0,
+        wavelengths_mm=(9.0, 40.0),
+        texture_seed=3,
+        supersampling=2,
+        light="spot",
+        light_mm=(10.0, 20.0, 30.0),
+        light_target_mm=(1.0, 2.0, 900.0),
+        light_cone=np.radians(6.0),
+        ambient_share=0.4,
+    )
+    stored = np.array([tifffile.imread(out / f"cam_{sx:02d}.tif") for sx in range(2)])
+    np.testing.assert_allclose(stored, cube.render(scene)[0, 0], rtol=1e-6)
+    assert set(np.unique(np.load(out / "truth.npz")["face"])) == {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["plane", "--size", "30"], "--size 30: must be WIDTHxHEIGHT"),
+        (["plane", "--velocity", "1,2"], "--velocity 1,2: 3 numbers are needed, not 2"),
+        (["plane", "--velocity", "a,b,c"], "must be numbers"),
+        (["plane", "--bits", "nine"], "--bits nine"),
+        (["plane", "--bits", "9"], "bits = 9"),
+        (["plane", "--centre-mm", "1"], "--centre-mm 1: 2 numbers"),
+        (["plane", "--brightness", "q,1,2"], "AXIS t, sx or sy"),
+        (["plane", "--brightness", "t,1"], "--brightness t,1,"),
+        (["plane", "--slope-x", "nan"], "zx = nan"),
+        (["cube", "--light", "moon"], "light 'moon'"),
+        (["cube", "--frames", "0"], "n_frames = 0"),
+    ],
+)
+def test_bad_values_are_one_line(
+    args: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[Any]
+) -> None:
+    assert command("simulate", args[0], tmp_path / "out", *args[1:]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
