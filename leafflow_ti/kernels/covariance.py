@@ -59,15 +59,7 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                 for i in range(lanes):
                     element[i] = ti.cast(J[begin + i], precise) * s
                 small.store(ws, noise + tri(r, c) * stride, element)
-        for r in range(flow):
-            for c in range(n_rows):
-                element = ti.Vector.zero(precise, lanes)
-                for m in range(flow):
-                    one = noise + tri(ti.max(r, m), ti.min(r, m)) * stride
-                    two = response_at + (m * n_rows + c) * stride
-                    for i in range(lanes):
-                        element[i] += ws[one + i] * ws[two + i]
-                small.store(ws, product + (r * n_rows + c) * stride, element)
+        small.symmetric_times(ws, noise, response_at, product, flow, n_rows, stride)
         factor_of = texture_smoothness(pixel, n_pixels, number, J)
         variance = base + (number[Region.VARIANCE] + solution) * stride
         for i in range(lanes):

@@ -105,6 +105,19 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                     ws[at + i] = total[i]
 
     @ti.func
+    def symmetric_times(ws: ti.template(), a: ti.i32, x: ti.i32, y: ti.i32, n: ti.i32, m: ti.i32, stride: ti.i32):
+        """``Y := A X`` for the packed symmetric matrix at ``a``, X and Y [n, m]."""
+        for r in range(n):
+            for c in range(m):
+                total = ti.Vector.zero(precise, lanes)
+                for k in range(n):
+                    one = a + tri(ti.max(r, k), ti.min(r, k)) * stride
+                    two = x + (k * m + c) * stride
+                    for i in range(lanes):
+                        total[i] += ws[one + i] * ws[two + i]
+                store(ws, y + (r * m + c) * stride, total)
+
+    @ti.func
     def dot(ws: ti.template(), x: ti.i32, xstep: ti.i32, y: ti.i32, ystep: ti.i32, n: ti.i32, stride: ti.i32):
         """``Σ_k X[k xstep] Y[k ystep]`` as a vector over the lanes."""
         total = ti.Vector.zero(precise, lanes)
@@ -256,6 +269,7 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         cholesky=cholesky,
         solve=solve,
         upper_times=upper_times,
+        symmetric_times=symmetric_times,
         dot=dot,
         store=store,
         jacobi=jacobi,

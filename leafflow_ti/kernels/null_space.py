@@ -235,38 +235,31 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
         n, k, flow = number[Number.N], number[Number.SOLUTIONS], number[Number.FLOW]
         factor = base + number[Region.TENSOR] * stride
         vectors = base + number[Region.VECTORS] * stride
-        for j in range(k):
+        images = base + number[Region.IMAGES] * stride
+        for j in range(BLOCK):
             norm = ti.Vector.zero(precise, lanes)
             for r in range(n):
                 element = ti.Vector.zero(precise, lanes)
-                if r < flow:
+                if j < k and r < flow:
                     at = base + (number[Region.PARAMETERS] + j * flow + r) * stride
                     for i in range(lanes):
                         element[i] = ws[at + i] / value[Value.SCALE + r]
-                elif r == flow + j:
+                elif j < k and r == flow + j:
                     for i in range(lanes):
                         element[i] = 1.0 / value[Value.SCALE + r]
                 noise = value[Value.NOISE + r] * value[Value.SCALE + r] * value[Value.SCALE + r]
                 for i in range(lanes):
                     norm[i] += noise * element[i] * element[i]
-                small.store(ws, vectors + r * BLOCK * stride, element)
-            energy = ti.Vector.zero(precise, lanes)
-            for r in range(n):
-                diagonal = factor + tri(r, r) * stride
-                own = vectors + r * BLOCK * stride
-                element = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ws[own + i] / ws[diagonal + i]
-                for m in range(r + 1, n):
-                    one = factor + tri(m, r) * stride
-                    two = vectors + m * BLOCK * stride
-                    for i in range(lanes):
-                        element[i] += ws[one + i] * ws[two + i]
-                for i in range(lanes):
-                    energy[i] += element[i] * element[i]
+                small.store(ws, vectors + (r * BLOCK + j) * stride, element)
+            if j < k:
+                small.store(ws, base + (number[Region.VARIANCE] + j) * stride, norm)
+        small.upper_times(ws, factor, vectors, images, n, BLOCK, stride)
+        for j in range(k):
+            energy = small.dot(ws, images + j * stride, BLOCK, images + j * stride, BLOCK, n, stride)
+            at = base + (number[Region.VARIANCE] + j) * stride
             for i in range(lanes):
-                energy[i] /= norm[i]
-            small.store(ws, base + (number[Region.VARIANCE] + j) * stride, energy)
+                energy[i] /= ws[at + i]
+            small.store(ws, at, energy)
 
     stages = (load, least_squares, factorise, accept, inverse_iteration, jacobi, parameters, residuals)
     return SimpleNamespace(**{f.__name__: batch_kernel(spec, f) for f in stages})

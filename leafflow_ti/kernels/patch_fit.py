@@ -313,15 +313,7 @@ def patch_fit_kernel(spec: KernelSpec):
         work = base + number[Region.MOTION_WORK] * stride
         normal = base + number[Region.NORMAL] * stride
         cov = base + number[Region.MOTION_COV] * stride
-        for r in range(n_rows):
-            for c in range(n):
-                element = ti.Vector.zero(precise, lanes)
-                for m in range(n_rows):
-                    one = total + tri(ti.max(r, m), ti.min(r, m)) * stride
-                    two = weighted + (m * n + c) * stride
-                    for i in range(lanes):
-                        element[i] += ws[one + i] * ws[two + i]
-                small.store(ws, work + (r * n + c) * stride, element)
+        small.symmetric_times(ws, total, weighted, work, n_rows, n, stride)
         for r in range(n):
             for c in range(n):
                 element = small.dot(ws, weighted + r * stride, n, work + c * stride, n, n_rows, stride)
