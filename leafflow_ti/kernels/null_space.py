@@ -15,6 +15,7 @@ from leafflow_ti.kernels.workspace import BLOCK, Number, Region, Value, batch_ke
 
 JACOBI_SWEEPS = 16
 RITZ_SWEEPS = 8
+ROUNDS = 4
 
 
 @functools.cache
@@ -29,10 +30,9 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """``A = S J S``, with a ridge, packed; and as a square matrix where the full Jacobi is wanted."""
+        """``A = S J S``, packed, with a ridge."""
         n = number[Number.N]
         packed = base + number[Region.TENSOR] * stride
-        full = base + number[Region.FULL] * stride
         trace = ti.Vector.zero(precise, lanes)
         for r in range(n):
             for c in range(r + 1):
@@ -42,9 +42,6 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
                 for i in range(lanes):
                     element[i] = ti.cast(J[begin + i], precise) * s
                 small.store(ws, packed + tri(r, c) * stride, element)
-                if number[Number.WITH_FULL] == 1:
-                    small.store(ws, full + (r * n + c) * stride, element)
-                    small.store(ws, full + (c * n + r) * stride, element)
                 if r == c:
                     for i in range(lanes):
                         trace[i] += element[i]
@@ -65,6 +62,8 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
         factor = base + number[Region.TENSOR] * stride
         vectors = base + number[Region.VECTORS] * stride
         small.cholesky(ws, factor, n, stride)
+        for i in range(lanes):
+            ws[base + number[Region.CONVERGED] * stride + i] = precise(0.0)
         for j in range(BLOCK):
             for back in range(n):
                 r = n - 1 - back
@@ -104,16 +103,59 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Mark every pixel as converged: the solution was direct."""
+        """Take the vectors as they are: the solution was direct."""
+        done = ti.Vector.zero(precise, lanes)
         for i in range(lanes):
-            ws[base + number[Region.CONVERGED] * stride + i] = precise(1.0)
+            done[i] = 1.0
+        keep(base, base + number[Region.VECTORS] * stride, BLOCK, stride, done, number, ws)
+
+    @ti.func
+    def keep(
+        base: ti.i32, source: ti.i32, width: ti.i32, stride: ti.i32,
+        done: ti.template(), number: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """The first vectors [n, width] at ``source`` solve the pixels that are ``done`` and were not before."""
+        n, k = number[Number.N], number[Number.SOLUTIONS]
+        solution = base + number[Region.SOLUTION] * stride
+        flag = base + number[Region.CONVERGED] * stride
+        fresh = ti.Vector.zero(precise, lanes)
+        for i in range(lanes):
+            fresh[i] = done[i] * (1.0 - ws[flag + i])
+        for r in range(n):
+            for j in range(k):
+                at = solution + (r * k + j) * stride
+                one = source + (r * width + j) * stride
+                element = ti.Vector.zero(precise, lanes)
+                for i in range(lanes):
+                    element[i] = ti.select(fresh[i] > 0.5, ws[one + i], ws[at + i])
+                small.store(ws, at, element)
+        for i in range(lanes):
+            fresh[i] += ws[flag + i]
+        small.store(ws, flag, fresh)
+
+    @ti.func
+    def any_left(base: ti.i32, stride: ti.i32, number: ti.template(), ws: ti.template()) -> ti.i32:
+        """Whether a pixel of the group has no solution yet."""
+        left = 0
+        for i in range(lanes):
+            left |= ti.cast(ws[base + number[Region.CONVERGED] * stride + i] < 0.5, ti.i32)
+        return left
 
     @ti.func
     def inverse_iteration(
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Block inverse iteration from the vectors that are there, then Rayleigh-Ritz; converged or not per pixel."""
+        """Rounds of block inverse iteration and Rayleigh-Ritz until all have converged.
+
+        A pixel keeps the solution of its first round that is good enough, so it does not depend on its neighbours.
+        """
+        for _ in range(ROUNDS):
+            if any_left(base, stride, number, ws) == 1:
+                one_round(base, stride, number, value, ws)
+
+    @ti.func
+    def one_round(base: ti.i32, stride: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()):
         n, k = number[Number.N], number[Number.SOLUTIONS]
         factor = base + number[Region.TENSOR] * stride
         vectors = base + number[Region.VECTORS] * stride
@@ -173,32 +215,35 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
                     error[i] += element[i] * element[i]
         last = ritz + ((k - 1) * BLOCK + k - 1) * stride
         following = ritz + (k * BLOCK + k) * stride
-        converged = ti.Vector.zero(precise, lanes)
+        done = ti.Vector.zero(precise, lanes)
         for i in range(lanes):
             gap = (ws[following + i] - ws[last + i]) * value[Value.GAP]
-            converged[i] = ti.cast(error[i] <= gap * gap, precise)
-        small.store(ws, base + number[Region.CONVERGED] * stride, converged)
+            done[i] = ti.cast(not error[i] > gap * gap, precise)
+        keep(base, vectors, BLOCK, stride, done, number, ws)
 
     @ti.func
     def jacobi(
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Full cyclic Jacobi of the square matrix; the k smallest eigenvectors become the first vectors."""
+        """Full cyclic Jacobi for the pixels that have no solution yet."""
         n, k = number[Number.N], number[Number.SOLUTIONS]
         full = base + number[Region.FULL] * stride
-        turn = base + number[Region.FULL_VECTORS] * stride
-        vectors = base + number[Region.VECTORS] * stride
-        small.jacobi(ws, full, n, JACOBI_SWEEPS, stride)
-        small.sort_eigen(ws, full, n, k, stride)
-        for j in range(k):
+        if any_left(base, stride, number, ws) == 1:
             for r in range(n):
-                at = turn + (r * n + j) * stride
-                element = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ws[at + i]
-                small.store(ws, vectors + (r * BLOCK + j) * stride, element)
-        accept(base, pixel, stride, n_pixels, number, value, J, ws, out)
+                for c in range(n):
+                    begin = number[Number.LOWER + tri(ti.max(r, c), ti.min(r, c))] * n_pixels + pixel
+                    s = value[Value.SCALE + r] * value[Value.SCALE + c]
+                    element = ti.Vector.zero(precise, lanes)
+                    for i in range(lanes):
+                        element[i] = ti.cast(J[begin + i], precise) * s
+                    small.store(ws, full + (r * n + c) * stride, element)
+            small.jacobi(ws, full, n, JACOBI_SWEEPS, stride)
+            small.sort_eigen(ws, full, n, k, stride)
+            done = ti.Vector.zero(precise, lanes)
+            for i in range(lanes):
+                done[i] = 1.0
+            keep(base, base + number[Region.FULL_VECTORS] * stride, n, stride, done, number, ws)
 
     @ti.func
     def parameters(
@@ -207,20 +252,20 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
     ):  # fmt: skip
         """Combine the vectors so that one time-like differential is 1 and the others 0 (section 3.3.2)."""
         k, flow = number[Number.SOLUTIONS], number[Number.FLOW]
-        vectors = base + number[Region.VECTORS] * stride
+        vectors = base + number[Region.SOLUTION] * stride
         target = base + number[Region.PARAMETERS] * stride
         for i in range(lanes):
             m = ti.Matrix.identity(precise, 3)
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):
                     if r < k and c < k:
-                        m[r, c] = ws[vectors + ((flow + r) * BLOCK + c) * stride + i] * value[Value.SCALE + flow + r]
+                        m[r, c] = ws[vectors + ((flow + r) * k + c) * stride + i] * value[Value.SCALE + flow + r]
             inverse = m.inverse()
             for f in range(flow):
                 v = ti.Vector.zero(precise, 3)
                 for c in ti.static(range(3)):
                     if c < k:
-                        v[c] = ws[vectors + (f * BLOCK + c) * stride + i] * value[Value.SCALE + f]
+                        v[c] = ws[vectors + (f * k + c) * stride + i] * value[Value.SCALE + f]
                 for j in ti.static(range(3)):
                     if j < k:
                         p = v[0] * inverse[0, j] + v[1] * inverse[1, j] + v[2] * inverse[2, j]

@@ -26,12 +26,13 @@ class Region(IntEnum):
     and of the motion solution, G geometry terms, M equations of the motion fit."""
 
     TENSOR = 0  # packed [N]: scaled structure tensor, then its Cholesky factor
-    VECTORS = auto()  # [N, BLOCK]: null space
+    VECTORS = auto()  # [N, BLOCK]: iterated vectors
     IMAGES = auto()  # [N, BLOCK]: factor times vectors
     RITZ = auto()  # [BLOCK, BLOCK]
     RITZ_VECTORS = auto()  # [BLOCK, BLOCK]
     FULL = auto()  # [N, N]: for the full Jacobi
     FULL_VECTORS = auto()  # [N, N]
+    SOLUTION = auto()  # [N, k]: null space, where CONVERGED
     CONVERGED = auto()  # [1]
     PARAMETERS = auto()  # [k, F]
     VARIANCE = auto()  # [k]: image noise variance of each residual
@@ -73,7 +74,6 @@ class Layout:
     rows_t: int
     terms: int
     motion: int
-    full: bool
 
     @property
     def sizes(self) -> dict[Region, int]:
@@ -81,7 +81,6 @@ class Layout:
         n, k, terms, motion = self.n, self.k, self.terms, self.motion
         s, t = self.rows_s, self.rows_t
         flow = n - k
-        full = n * n if self.full else 0
 
         def packed(m: int) -> int:
             return m * (m + 1) // 2
@@ -92,8 +91,9 @@ class Layout:
             Region.IMAGES: n * BLOCK,
             Region.RITZ: BLOCK * BLOCK,
             Region.RITZ_VECTORS: BLOCK * BLOCK,
-            Region.FULL: full,
-            Region.FULL_VECTORS: full,
+            Region.FULL: n * n,
+            Region.FULL_VECTORS: n * n,
+            Region.SOLUTION: n * k,
             Region.CONVERGED: 1,
             Region.PARAMETERS: k * flow,
             Region.VARIANCE: k,
@@ -143,8 +143,7 @@ class Number(IntEnum):
     N = len(Region)  # columns
     SOLUTIONS = auto()  # k
     FLOW = auto()  # F = N - k
-    WITH_FULL = auto()  # the full Jacobi is wanted: load the square matrix too
-    ITERATIONS = auto()  # of the block inverse iteration
+    ITERATIONS = auto()  # of the block inverse iteration, per round
     MOTION_SOLUTION = auto()  # index of the solution along t, or -1
     TERMS = auto()  # G: geometry terms (1, x, y, t), 0 without a grid
     OFFSETS = auto()  # number of motion offsets

@@ -104,7 +104,7 @@ class EstimateStage:
         rows = self._rows()
         self.layout = Layout(
             columns.n, columns.n_time_like, len(rows.camera[0]) if rows.camera else 0, len(rows.motion),
-            len(problem.terms), 2 * len(problem.offsets) + problem.use_range, problem.solver == "jacobi",
+            len(problem.terms), 2 * len(problem.offsets) + problem.use_range,
         )  # fmt: skip
         flow = columns.n_flow
         self.numbers = np.full(Number.LOWER + len(layout.lower), -1, np.int32)
@@ -144,7 +144,6 @@ class EstimateStage:
         number, value = self.numbers, self.values
         precision = self.device.algebra
         number[Number.N], number[Number.SOLUTIONS], number[Number.FLOW] = columns.n, columns.n_time_like, columns.n_flow
-        number[Number.WITH_FULL] = problem.solver == "jacobi"
         number[Number.ITERATIONS] = problem.iterations
         has_time = "t" in columns.solutions
         number[Number.MOTION_SOLUTION] = columns.n_time_like - 1 if has_time else -1

@@ -31,10 +31,10 @@ def _null_space(stage: Any, value: Any) -> Solve:
     def solve(launch: Callable[..., None]) -> None:
         launch(kernels.load, value)
         launch(kernels.least_squares, value)
-        if stage.problem.solver == "jacobi":
-            launch(kernels.jacobi, value)
-        else:
+        if stage.problem.solver == "fast":
             launch(kernels.inverse_iteration, value)
+        # All pixels, or those whose gap is too small for the iteration.
+        launch(kernels.jacobi, value)
         launch(kernels.parameters, value)
         if value is not None:
             # Residuals and covariances are worked out on the equilibrated tensor.
