@@ -87,6 +87,16 @@ def noise_gain(sampling: Sampling, channel: str) -> float:
     return float(np.prod([np.sum(sampling.axis(a).kernel(a == channel) ** 2) for a in AXES]))
 
 
+def white_smoothness(sampling: Sampling) -> float:
+    """Share of the gradient's energy that smoothing in x and y once more leaves of white noise; 1 without smoothing."""
+
+    def share(axis: AxisSampling, differentiate: bool) -> float:
+        h = axis.kernel(differentiate)
+        return float(np.sum(np.convolve(h, axis.kernel(False)) ** 2) / np.sum(h**2))
+
+    return share(sampling.x, True) * share(sampling.y, False)
+
+
 def column_noise(sampling: Sampling, columns: ColumnSet) -> Array:
     """Diagonal of ``C = Σ w C_i``, the noise covariance of the columns summed over the window; shape (N,).
 

@@ -84,11 +84,10 @@ def sampling_of(grid: str, time: bool, pixel: AxisSampling | None = None, camera
 
 
 @functools.cache
-def rendered(grid: str, lit: bool, size: tuple[int, int], noise: float = 1.0, seed: int = 0) -> np.ndarray:
-    """Preshifted blocks [t, sy, sx, y, x] of the scene, float64."""
+def rendered(scene: PlaneScene, grid: str, size: tuple[int, int]) -> np.ndarray:
+    """Preshifted blocks [t, sy, sx, y, x] of a scene, float64."""
     n_rows, n_cols = GRIDS[grid]
-    scene = replace(SCENE, n_rows=n_rows, n_cols=n_cols, size=size, noise=noise, seed=seed)
-    scene = replace(scene, brightness=LIGHT if lit else ())
+    scene = replace(scene, n_rows=n_rows, n_cols=n_cols, size=size)
     x, y = scene.principal
     out = np.empty((scene.n_frames, n_rows, n_cols, size[1], size[0]))
     for row in range(n_rows):
@@ -256,7 +255,8 @@ def bench(device: Callable[[str], Device]) -> MakeBench:
     def make(model: str, brightness: str, grid: str, precision: str, stride: int = STRIDE, cols: int = COLS) -> Bench:
         sampling = sampling_of(grid, MODELS[model].time, cameras=MODELS[model].cameras)
         band = Band.of(sampling, ROWS, cols, stride)
-        images = rendered(grid, brightness != "none", (band.in_cols, band.in_rows))
+        scene = replace(SCENE, brightness=LIGHT if brightness != "none" else ())
+        images = rendered(scene, grid, (band.in_cols, band.in_rows))
         if MODELS[model].cameras == "line" and min(GRIDS[grid]) > 1:
             images = images[:, GRIDS[grid][0] // 2][:, None]
         if not MODELS[model].time:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 import leafflow_ti as lf
 from leafflow_ti.capture import Geometry, capture_from_array
@@ -70,34 +71,46 @@ def test_constant_images_have_no_structure(
     assert_values_follow_status(field)
 
 
+def share(field: lf.Field, *codes: Status) -> float:
+    """Part of the pixels off the border that have one of the codes."""
+    return float(np.isin(field.status, codes).sum() / np.sum(field.status != Status.BORDER))
+
+
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("model", MODELS)
 def test_pure_noise_has_no_value(images: np.ndarray, model: str, estimator: str) -> None:
     noise = np.random.default_rng(0).normal(100, 5, images.shape)
-    field = measure(noise, model, estimator=estimator)
-    assert statuses(field) <= {Status.NO_STRUCTURE, Status.INCOHERENT, Status.NOT_CONVERGED}
+    field = measure(noise, model, estimator=estimator, window=25, sigma=7)
+    assert statuses(field) <= {Status.NO_STRUCTURE, Status.INCOHERENT}
+    # A window of noise may by chance look smooth enough for texture: then it is texture that does not move as one.
+    assert np.mean(field.status[field.status != Status.BORDER] == Status.NO_STRUCTURE) >= 0.9
     assert_values_follow_status(field)
 
 
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("model", MODELS)
-def test_content_that_jumps_is_incoherent(images: np.ndarray, model: str) -> None:
-    """Smooth texture that has nothing to do with that of the frame before: much structure, no motion explains it."""
-    jumping = np.stack([np.roll(frame, (7 * t * t, 11 * t * t), (-2, -1)) for t, frame in enumerate(images)])
-    assert Status.OK not in statuses(measure(jumping, model))
-    assert Status.INCOHERENT in statuses(measure(jumping, model))
-
-
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_one_dimensional_texture_is_an_aperture_problem(model: str, noise: float) -> None:
-    stripes = render(replace(SCENE, wavelengths_mm=(0.6, 1e9), noise=noise))
-    field = measure(stripes, model, solver="jacobi")
-    assert statuses(field) == {Status.APERTURE}
+def test_images_that_share_nothing_are_incoherent(images: np.ndarray, model: str, estimator: str) -> None:
+    """Good smooth texture everywhere, but another one in every image."""
+    random = np.random.default_rng(0)
+    texture = gaussian_filter(random.normal(size=images.shape), (0, 0, 0, 1.5, 1.5))
+    field = measure(100 + 30 * texture / texture.std(), model, estimator=estimator, window=25, sigma=7)
+    assert statuses(field) == {Status.INCOHERENT}
     assert_values_follow_status(field)
-    if noise and model == "flow":
-        # Along the stripes nothing is known, and the standard errors say so; across them they are as good as ever.
-        known = measure(render(SCENE), model)["flow_x_std"]
-        assert np.nanmedian(field["flow_x_std"]) > 10 * np.nanmedian(known)
+
+
+@pytest.mark.parametrize("solver", ["fast", "jacobi"])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("model", MODELS)
+def test_one_dimensional_texture_is_an_aperture_problem(model: str, estimator: str, solver: str) -> None:
+    stripes = render(replace(SCENE, wavelengths_mm=(0.6, 1e9)))
+    field = measure(stripes, model, estimator=estimator, solver=solver)
+    off_border = field.status[field.status != Status.BORDER]
+    assert np.mean(off_border == Status.APERTURE) >= 0.98  # by chance the noise looks like texture across the stripes
+    assert_values_follow_status(field)
+    if model == "flow":
+        # Along the stripes nothing is known, and the standard errors say so.
+        known = measure(render(SCENE), model, estimator=estimator)["flow_y_std"]
+        assert np.nanmedian(field["flow_y_std"]) > 5 * np.nanmedian(known)
 
 
 def test_full_texture_is_ok(images: np.ndarray) -> None:
@@ -133,22 +146,20 @@ def test_pixels_that_are_not_finite_stay_in_their_windows(images: np.ndarray) ->
     near[20 - RADIUS - 2 : 21 + RADIUS + 3, 30 - RADIUS - 2 : 34 + RADIUS + 3] = True
     for name in whole:
         np.testing.assert_array_equal(field[name][~near], whole[name][~near], err_msg=name)
-    with np.errstate(invalid="ignore"):
-        difference = np.abs(field["depth"] - whole["depth"]) / whole["depth_std"]
-    assert 0 < np.nanmax(difference) < 5
+    assert 0 < np.nanmax(np.abs(field["depth"] - whole["depth"]) / field["depth_std"]) < 8
 
 
 def test_masked_pixels_have_no_influence(images: np.ndarray, tmp_path: Path) -> None:
     keep = np.full(images.shape[-2:], 255, np.uint8)
     keep[18:26, 24:40] = 0
     (tmp_path / "mask.pgm").write_bytes(b"P5 64 44 255\n" + keep.tobytes())
-    field = measure(images, mask=tmp_path / "mask.pgm")
+    field = measure(images, "flow-affine", mask=tmp_path / "mask.pgm")
     np.testing.assert_array_equal((field.status == Status.MASKED)[keep == 0], True)
     np.testing.assert_array_equal((field.status == Status.MASKED)[keep != 0], False)
     assert_values_follow_status(field)
     spoiled = images.copy()
     spoiled[..., keep == 0] = 1e4
-    other = measure(spoiled, mask=tmp_path / "mask.pgm")
+    other = measure(spoiled, "flow-affine", mask=tmp_path / "mask.pgm")
     np.testing.assert_array_equal(field.status, other.status)
-    for name in ("depth", "slope_x", "flow_x"):
+    for name in ("flow_x", "flow_y"):
         np.testing.assert_array_equal(field[name], other[name], err_msg=name)

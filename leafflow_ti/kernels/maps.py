@@ -54,6 +54,8 @@ def maps_kernel(spec: KernelSpec):
         yy = ti.cast(J[number[Number.LOWER + tri(iy, iy)] * n_pixels + at], precise)
         mass = ti.cast(J[number[Number.EXTRA] * n_pixels + at], precise)
         level = ti.cast(J[(number[Number.EXTRA] + 3) * n_pixels + at], precise)
+        gradient = ti.cast(J[(number[Number.EXTRA] + 1) * n_pixels + at], precise)
+        smooth = ti.cast(J[(number[Number.EXTRA] + 2) * n_pixels + at], precise)
         noise = precise(0.0)
         energy = precise(0.0)
         for j in range(number[Number.SOLUTIONS]):
@@ -66,8 +68,11 @@ def maps_kernel(spec: KernelSpec):
         result = ti.cast(ok, ti.i32)
         if mass < value[Value.MIN_MASS]:
             result = border
-        elif not (half > value[Value.MIN_STRUCTURE] * level and half > 2 * noise * gain):
+        elif not half > value[Value.MIN_STRUCTURE] * level:
             result = no_structure
+        elif not half > 2 * noise * gain:
+            # The constraint explains nothing: there is nothing but noise, or texture that does not move as one.
+            result = ti.select(smooth > value[Value.ROUGHEST] * gradient, incoherent, no_structure)
         elif not (energy < value[Value.MAX_RESIDUAL] * value[Value.MAX_RESIDUAL] * 2 * half):
             result = incoherent
         elif ws[base + number[Region.CONVERGED] * stride + i] < 0.5:

@@ -185,6 +185,7 @@ class Value(IntEnum):
     GAIN = auto()  # noise gain of the gradient: x and y
     MIN_MASS = auto()
     MIN_STRUCTURE = auto()  # least gradient energy per energy of the image
+    ROUGHEST = auto()  # share of the gradient's energy that one more smoothing leaves, below which it is noise
     MAX_RESIDUAL = auto()  # px, for status incoherent
     GAP = auto()  # convergence: residual per gap
     SCALE = auto()  # MAX_COLUMNS

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.models import AXES, Column, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_gain, noise_ratio
+from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_gain, noise_ratio, white_smoothness
 from leafflow_ti.stages.estimators import ESTIMATORS
 
 BATCH_BYTES = 8 << 20
@@ -171,6 +171,7 @@ class EstimateStage:
         value[Value.NOISE : Value.NOISE + columns.n] = noise
         value[Value.GAIN] = noise_gain(sampling, "x")
         value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
+        value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
         value[Value.RANGE_CAUTION] = RANGE_CAUTION
         lower = np.tril_indices(columns.n_flow)

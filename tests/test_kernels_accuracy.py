@@ -1,0 +1,129 @@
+"""What the whole chain reaches on exact scenes: the sinusoid and the rotating cube of Schuchert 2010, section 5.3.
+
+Limits are those of the project's specification; angular errors are those of ``(v, 1)`` (Schuchert 2010, Eq. (A.2)).
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from scipy.ndimage import minimum_filter
+
+import leafflow_ti as lf
+from leafflow_ti.capture import Capture, Geometry, capture_from_array
+from leafflow_ti.status import Status
+from leafflow_ti.synthetic import cube, plane
+
+SEEDS = 24
+NOISE = 2.5
+SINUSOID = plane.sinusoid_scene(size=(301, 181))
+OPTIONS: dict[str, object] = {
+    "model": "affine-4d", "motion": "rotation", "preshift": (-14, 0), "window": 65, "sigma": 19,
+}  # fmt: skip
+
+
+def capture_of(scene: plane.PlaneScene | cube.CubeScene, images: np.ndarray) -> Capture:
+    return capture_from_array(images, Geometry(scene.f_px, scene.principal, scene.baseline_mm))
+
+
+def vector(field: lf.Field, quantity: str) -> np.ndarray:
+    """A vector quantity of a field, float64 [y, x, 3]."""
+    return np.stack([field[f"{quantity}_{axis}"] for axis in "xyz"], axis=-1).astype(float)
+
+
+def angle(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Angle [°] between ``(found, 1)`` and ``(wanted, 1)``, [..., 3] each; exact for the tiniest angles."""
+    one, two = (np.concatenate([v, np.ones((*v.shape[:-1], 1))], axis=-1) for v in np.broadcast_arrays(found, wanted))
+    one, two = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (one, two))
+    return np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(one - two, axis=-1)))
+
+
+@functools.cache
+def sinusoid_images() -> np.ndarray:
+    return plane.render(SINUSOID)
+
+
+@functools.cache
+def sinusoid_errors(precision: str) -> dict[str, np.ndarray]:
+    """Errors over the pixels |x - cx| <= 60, |y - cy| <= 56, whose windows lie inside all images; noise free."""
+    field = lf.estimate(capture_of(SINUSOID, sinusoid_images()), **OPTIONS, stride=8, precision=precision)
+    exact = plane.truth(SINUSOID)
+    cx, cy = SINUSOID.principal
+    inner = np.ix_(np.abs(field.y - cy) <= 56, np.abs(field.x - cx) <= 60)
+    assert (field.status[inner] == Status.OK).all()
+    at = tuple(np.ix_(field.y, field.x))
+    return {
+        "depth": np.abs(field["depth"] / exact["depth"][at] - 1)[inner],
+        "velocity": angle(vector(field, "velocity"), exact["velocity"][at])[inner],
+        "rotation": angle(vector(field, "rotation"), exact["omega"])[inner],
+    }
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_sinusoid_without_noise(precision: str) -> None:
+    errors = sinusoid_errors(precision)
+    assert errors["depth"].size == 14 * 15
+    assert np.max(errors["depth"]) <= 5e-6
+    assert np.mean(errors["velocity"]) <= 3e-4
+    assert np.mean(errors["rotation"]) <= 2e-5
+
+
+def test_single_precision_is_as_accurate() -> None:
+    """float32 is enough because the columns are equilibrated: within 10 % of what double precision reaches."""
+    single, double = sinusoid_errors("f32"), sinusoid_errors("f64")
+    for name in double:
+        assert np.mean(single[name]) == pytest.approx(np.mean(double[name]), rel=0.1), name
+
+
+def test_sinusoid_with_noise_and_its_error_bars() -> None:
+    """Overlapping windows err together, so the samples are many noises at nine pixels three window sigmas apart.
+
+    Their 216 deviations know their own spread to 5 %.
+    """
+    exact = plane.truth(SINUSOID)
+    velocity, rotation = [], []
+    deviations: dict[str, list[np.ndarray]] = {}
+    for seed in range(SEEDS):
+        noise = np.random.default_rng(seed).normal(0, NOISE, sinusoid_images().shape)
+        capture = capture_of(SINUSOID, (sinusoid_images() + noise).astype(np.float32))
+        field = lf.estimate(capture, **OPTIONS, stride=56, roi=(94, 34, 207, 147))
+        assert field.shape == (3, 3)
+        assert (field.status == Status.OK).all()
+        at = np.ix_(field.y, field.x)
+        velocity.append(angle(vector(field, "velocity"), exact["velocity"][at]))
+        rotation.append(angle(vector(field, "rotation"), exact["omega"]))
+        wanted = {"depth": exact["depth"], "slope_x": exact["zx"], "slope_y": exact["zy"]}
+        wanted |= {f"velocity_{axis}": exact["velocity"][..., i] for i, axis in enumerate("xyz")}
+        for name, values in wanted.items():
+            deviations.setdefault(name, []).append((field[name] - values[at]) / field[f"{name}_std"])
+    assert np.mean(velocity) <= 0.06
+    assert np.mean(rotation) <= 0.002
+    spread = {name: float(np.std(z)) for name, z in deviations.items()}
+    assert all(0.8 <= s <= 1.25 for s in spread.values()), spread
+
+
+@pytest.fixture(scope="module")
+def cube_field() -> tuple[lf.Field, dict[str, np.ndarray]]:
+    """The default cube and its truth at the output pixels; ``face`` is 0 where a window sees more than one face."""
+    scene = cube.CubeScene()
+    field = lf.estimate(capture_of(scene, cube.render(scene)), **OPTIONS, stride=8)
+    exact = cube.truth(scene)
+    face = exact["face"]
+    radius = 32 + 2
+    uniform = minimum_filter(face, 2 * radius + 1) == -minimum_filter(-face, 2 * radius + 1)
+    at = np.ix_(field.y, field.x)
+    found = {name: exact[name][at] for name in ("depth", "velocity")}
+    return field, {**found, "omega": exact["omega"], "face": np.where(uniform, face, 0)[at]}
+
+
+@pytest.mark.parametrize("face", [pytest.param(1, id="left"), pytest.param(2, id="right")])
+def test_rotating_cube(cube_field: tuple[lf.Field, dict[str, np.ndarray]], face: int) -> None:
+    field, exact = cube_field
+    inner = (exact["face"] == face) & (field.status == Status.OK)
+    assert inner.sum() >= 50
+    assert np.mean(angle(vector(field, "rotation"), exact["omega"])[inner]) <= 0.004
+    assert np.mean(np.abs(field["depth"] - exact["depth"])[inner]) <= 0.05
+    if face == 2:
+        assert np.mean(angle(vector(field, "velocity"), exact["velocity"])[inner]) <= 0.22

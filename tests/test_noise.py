@@ -1,0 +1,74 @@
+"""Error bars against repeated noise: do predicted covariances describe what really happens?"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+
+import conftest
+import numpy as np
+import pytest
+from reference import chain
+
+from leafflow_ti.models import MODELS, column_set
+from leafflow_ti.status import Status
+
+SCENE = replace(
+    conftest.SCENE,
+    noise=2.0,
+    velocity=(0.01, -0.007, 0.0),
+    omega=(0.0, 0.0, 0.0),
+    acceleration=(0.0, 0.0, 0.0),
+    wavelengths_mm=(0.8, 0.8),
+    alpha=0.3,
+    beta=0.3,
+)
+"""Nearly still, so that noise is all that disturbs; all its spatial frequencies are equally high, as ρ supposes."""
+
+SEEDS = 40
+PLACES = ((0, 0), (0, 1), (1, 0), (1, 1))
+DISTANCE = 17  # px: windows of 11 and filters of 5 pixels do not overlap, so the places are independent samples
+
+
+@functools.cache
+def estimates(make_bench: Callable, model: str, estimator: str) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+    """Over seeds and places: parameters [n, places, m], predicted standard deviations likewise, noise variances."""
+    sampling = conftest.sampling_of("line-x", True)
+    columns = column_set(MODELS[model], "none", sampling.camera_axes, sampling.sampled)
+    names = [f"{axis}: {c.channel}{c.offset}" for axis in columns.solutions for c in columns.columns[: columns.n_flow]]
+    halo = sampling.x.radius + sampling.x.filter_radius
+    size = (DISTANCE + 1 + 2 * halo, DISTANCE + 1 + 2 * halo)
+    found, predicted, variances = [], [], []
+    for seed in range(SEEDS):
+        images = conftest.rendered(replace(SCENE, seed=seed), "line-x", size)
+        bench = make_bench(images, sampling, columns, "f32", (2, 2), DISTANCE)
+        result = bench.estimate(estimator=estimator)
+        assert (result.status == Status.OK).all()
+        std = []
+        for place in PLACES:
+            smooth, energy = bench.planes[-2, *place], bench.planes[-3, *place]
+            cov = chain.covariances(bench.tensor(*place), result.variance[place], columns, sampling, smooth / energy)
+            std.append(np.concatenate([np.sqrt(np.diag(cov[k, k])) for k in range(columns.n_time_like)]))
+        found.append([result.parameters[place].ravel() for place in PLACES])
+        predicted.append(std)
+        variances.append([result.variance[place] for place in PLACES])
+    return names, np.array(found), np.array(predicted), np.array(variances)
+
+
+@pytest.mark.parametrize("estimator", ["ols", "tls-equilibrated"])
+@pytest.mark.parametrize("model", ["affine", "affine-4d"])
+def test_predicted_standard_deviations_are_the_empirical_ones(make_bench: Callable, model: str, estimator: str) -> None:
+    """160 samples about 4 means know a standard deviation to 1 / sqrt(2 * 156) = 6 %, so .7 to 1.4 is five of these
+    standard errors: that much more than chance is left to the approximations of the covariance."""
+    names, found, predicted, _ = estimates(make_bench, model, estimator)
+    empirical = np.sqrt(np.mean(np.var(found, axis=0, ddof=1), axis=0))
+    ratio = np.sqrt(np.mean(predicted**2, axis=(0, 1))) / empirical
+    assert all(0.7 <= r <= 1.4 for r in ratio), dict(zip(names, ratio.round(2).tolist(), strict=True))
+
+
+@pytest.mark.parametrize("estimator", ["ols", "tls-equilibrated"])
+def test_noise_variance_is_found(make_bench: Callable, estimator: str) -> None:
+    """One window holds some hundred independent residuals, all of them ten thousand: 10 % is far above chance."""
+    *_, variances = estimates(make_bench, "affine", estimator)
+    assert variances.mean(axis=(0, 1)) == pytest.approx(SCENE.noise**2, rel=0.1)

@@ -1,0 +1,105 @@
+"""The same kernels on the Vulkan back end, in a process of its own: an engine runs one arch per process.
+
+``test_suite_on_vulkan`` starts it; the functions ``on_vulkan_*`` are what it runs there. Skipped only where no Vulkan
+driver is installed, and not even there with ``LEAFFLOW_TI_REQUIRE_VULKAN=1``, as the continuous integration sets.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reference import chain
+from tolerances import SOLVERS, tolerance
+
+from leafflow_ti.status import Status
+
+pytestmark = pytest.mark.vulkan
+PIXELS = ((0, 0), (1, 3), (2, 4))
+SYSTEMS = [
+    ("depth", "none", "line-x", None),
+    ("depth", "camera", "square", None),
+    ("affine-4d", "none", "line-x", "rotation"),
+]
+
+
+def driver_installed() -> bool:
+    """Whether a loader and at least one driver are there."""
+    chosen = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    roots = (Path("/etc/vulkan/icd.d"), Path("/usr/share/vulkan/icd.d"))
+    files = chosen.split(os.pathsep) if chosen else [f for root in roots for f in root.glob("*.json")]
+    return ctypes.util.find_library("vulkan") is not None and bool(files)
+
+
+def test_suite_on_vulkan() -> None:
+    if not driver_installed() and os.environ.get("LEAFFLOW_TI_REQUIRE_VULKAN") != "1":
+        pytest.skip("no Vulkan driver is installed (apt-get install libvulkan1 mesa-vulkan-drivers)")
+    command = [
+        sys.executable, "-m", "pytest", __file__, "-q", "-p", "no:cacheprovider", "-o", "python_functions=on_vulkan_*",
+    ]  # fmt: skip
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    assert f"{len(SYSTEMS) + 3} passed" in done.stdout
+
+
+def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
+    from leafflow_ti.kernels.engine import ti
+
+    assert device("f32").arch == "vulkan"
+    assert device("f32").gpu
+    assert ti.lang.impl.current_cfg().arch == ti.vulkan
+
+
+def on_vulkan_filtering_is_correlation(device: Callable) -> None:
+    """The plane kernel alone: shifts, weights, strides and a displaced target."""
+    from leafflow_ti.stages.tensor import Filtering
+
+    d = device("f32")
+    random = np.random.default_rng(1)
+    rows, pitch, weights = 6, 64, random.normal(size=5)
+    planes = random.normal(size=(2, 2 * rows + 4, pitch)).astype(np.float32)
+    size = planes[0].size
+    terms = [[(p * size + r * pitch, float(w)) for r, w in enumerate(weights)] for p in range(2)]
+    target = d.array(np.zeros(10 + 2 * rows * pitch))
+    Filtering(d, terms, rows, pitch, 2 * pitch)(d.array(planes), target, 10)
+    wanted = [sum(w * plane[r : r + 2 * rows : 2].astype(float) for r, w in enumerate(weights)) for plane in planes]
+    found = d.host(target)
+    np.testing.assert_allclose(found[10:].reshape(2, rows, pitch), wanted, atol=1e-5)
+    assert not found[:10].any()
+
+
+@pytest.mark.parametrize(("model", "brightness", "grid", "motion"), SYSTEMS)
+def on_vulkan_the_chain_equals_the_twin(
+    bench: Callable, model: str, brightness: str, grid: str, motion: str | None
+) -> None:
+    b = bench(model, brightness, grid, "f32")
+    limit = tolerance(b.device)
+    found = b.estimate(motion)
+    for pixel in PIXELS:
+        J, rho = b.reference(*pixel)
+        scale = np.sqrt(np.diag(J))
+        assert np.max(np.abs(b.tensor(*pixel) - J) / np.outer(scale, scale)) <= limit.tensor
+        assert found.status[pixel] == Status.OK
+        reference = chain.measure(J, rho, found.problem, b.view, *b.position(*pixel))
+        for name, (value, std) in reference.items():
+            map_value, map_std = (m[pixel] for m in found.map(name))
+            assert abs(map_value - value) <= limit.maps * std, name
+            assert map_std == pytest.approx(std, rel=limit.errors), name
+
+
+def on_vulkan_the_solvers_agree(bench: Callable) -> None:
+    b = bench("affine-4d", "none", "line-x", "f32")
+    fast, full = (b.estimate(solver=solver) for solver in ("fast", "jacobi"))
+    for pixel in PIXELS:
+        P, variance = chain.solve(b.tensor(*pixel), b.columns, b.sampling, "tls-equilibrated")
+        cov = chain.covariances(b.tensor(*pixel), variance, b.columns, b.sampling)
+        std = np.sqrt([np.diag(cov[k, k]) for k in range(b.columns.n_time_like)])
+        assert np.max(np.abs(fast.parameters[pixel] - full.parameters[pixel]) / std) <= SOLVERS
+        assert np.max(np.abs(full.parameters[pixel] - P.T) / std) <= tolerance(b.device).parameters
