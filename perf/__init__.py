@@ -1,1 +1,1 @@
-"""Measured figures of leafflow-ti, each made by one command: ``python -m perf NAME`` (``python -m perf`` lists them)."""
+"""Measured figures of leafflow-ti, each made by one command: ``python -m perf NAME``; without a name it lists them."""

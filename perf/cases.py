@@ -20,7 +20,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Case:
-    """One command. ``home``: ``module:function`` inside this package; the function takes Options, returns an Outcome."""
+    """One command. ``home``: ``module:function`` of this package; the function takes Options, returns an Outcome."""
 
     name: str
     home: str
@@ -34,10 +34,20 @@ class Case:
 
 
 CASES = (
-    Case("table-3.1", "table31:run", "depth and slope of a sinusoidal plane, 1D and 2D grid, four orientations (Table 3.1)"),
-    Case("sinusoid", "sinusoid:run", "motion of a sinusoidal plane in 4D, with and without noise, error bars (section 5.3)"),
+    Case(
+        "table-3.1",
+        "table31:run",
+        "depth and slope of a sinusoidal plane, 1D and 2D grid, four orientations (Table 3.1)",
+    ),
+    Case(
+        "sinusoid",
+        "sinusoid:run",
+        "motion of a sinusoidal plane in 4D, with and without noise, error bars (section 5.3)",
+    ),
     Case("cube", "cube:run", "rotating cube: motion, rotation and depth per face and set of rows (Table 5.1)"),
-    Case("hci-cotton", "cotton:run", "real 9x9 light field: disparity and normals of the whole image against its truth"),
+    Case(
+        "hci-cotton", "cotton:run", "real 9x9 light field: disparity and normals of the whole image against its truth"
+    ),
     Case("yosemite", "yosemite:run", "affine optical flow of the Yosemite sequence against its truth"),
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
     Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),

@@ -1,10 +1,10 @@
 """The light field "cotton" of the HCI 4D light field benchmark: a real-sized static 9x9 grid with its truth.
 
-The images were shifted so that the disparity seen is 0 at 4.25 m: the capture states the offset ``-f b / 4.25 m`` px per step.
-The truth ``d`` counts the other way: a point of the middle view at x appears at ``x - d k`` in camera k, so that the disparity seen
-is ``-d``. What is seen reaches ±1.5 px per step, more than the derivative filters of the fine texture allow; the second
-measurement runs with the preshifts -1, 0 and 1 and keeps, per pixel, the result with the smallest standard error among those that
-leave less than a pixel.
+The images were shifted so that the disparity seen is 0 at 4.25 m: the capture states the offset ``-f b / 4.25 m`` px
+per step. The truth ``d`` counts the other way: a point of the middle view at x appears at ``x - d k`` in camera k, so
+that the disparity seen is ``-d``. What is seen reaches ±1.5 px per step, more than the derivative filters of the fine
+texture allow; the second measurement runs with the preshifts -1, 0 and 1 and keeps, per pixel, the result with the
+smallest standard error among those that leave less than a pixel.
 """
 
 from __future__ import annotations
@@ -37,13 +37,12 @@ LARGEST_RESIDUAL_PX = 1.0
 
 @dataclass(frozen=True)
 class Settings:
-    """Options of ``run`` that were found best among windows of 9 to 21 pixels, filters of 3, 5 and 7 taps, one to five camera
-    samples, and the estimators. The full Jacobi solver: windows that straddle edges have small gaps between eigenvalues."""
+    """Options of ``run``: the best of windows of 9 to 21 pixels, filters of 3, 5 and 7 taps, one to five camera samples
+    of equal and unequal weight, and the estimators."""
 
     window: int = 15
     sigma_camera: float = 2.0
     estimator: str = "tls-equilibrated"
-    solver: str = "jacobi"
     border: str = "clip"
     stride: int = 1
     roi: tuple[int, int, int, int] = (0, 0, SIZE_PX, SIZE_PX)
@@ -88,10 +87,17 @@ def estimate_cotton(capture: FileCapture, settings: Settings, preshift_px: int =
     from leafflow_ti.api import estimate
 
     return estimate(
-        capture, frame=0, model="depth", preshift=(preshift_px, preshift_px), window=settings.window, stride=settings.stride,
-        sigma_camera=settings.sigma_camera, estimator=settings.estimator, solver=settings.solver, border=settings.border,
+        capture,
+        frame=0,
+        model="depth",
+        preshift=(preshift_px, preshift_px),
+        window=settings.window,
+        stride=settings.stride,
+        sigma_camera=settings.sigma_camera,
+        estimator=settings.estimator,
+        border=settings.border,
         roi=settings.roi,
-    )  # fmt: skip
+    )
 
 
 def merge(fields: Sequence[Field], preshifts_px: Sequence[int], offset_px: float) -> Field:
@@ -106,7 +112,8 @@ def merge(fields: Sequence[Field], preshifts_px: Sequence[int], offset_px: float
     best = np.argmin(cost, axis=0)
 
     def chosen(maps: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        return np.take_along_axis(np.stack(maps), best[None], axis=0)[0]
+        kept: NDArray[Any] = np.take_along_axis(np.stack(maps), best[None], axis=0)[0]
+        return kept
 
     first = fields[0]
     merged = {name: chosen([f[name] for f in fields]) for name in first}
@@ -127,10 +134,21 @@ def figures_of(label: str, field: Field, truth: Truth) -> tuple[Figure, ...]:
     size = np.abs(disparity[known])
     return (
         Figure(f"median disparity error, {label}", float(np.median(size)), "px", 0.01),
-        Figure(f"BadPix({BAD_PX}), {label}", 100 * float(np.mean(size > BAD_PX)), "%", note="of the pixels with a value"),
+        Figure(
+            f"BadPix({BAD_PX}), {label}", 100 * float(np.mean(size > BAD_PX)), "%", note="of the pixels with a value"
+        ),
         Figure(f"RMS disparity error, {label}", float(np.sqrt(np.mean(size**2))), "px"),
-        Figure(f"RMS of the smallest 99 %, {label}", float(np.sqrt(np.mean(np.sort(size)[: int(0.99 * size.size)] ** 2))), "px"),
-        Figure(f"median normal error, {label}", float(np.median(tilt[known])), "deg", note="truth: differences of the depth map"),
+        Figure(
+            f"RMS of the smallest 99 %, {label}",
+            float(np.sqrt(np.mean(np.sort(size)[: int(0.99 * size.size)] ** 2))),
+            "px",
+        ),
+        Figure(
+            f"median normal error, {label}",
+            float(np.median(tilt[known])),
+            "deg",
+            note="truth: differences of the depth map",
+        ),
         Figure(f"pixels with a value, {label}", 100 * float(known.mean()), "%"),
     )
 
@@ -145,9 +163,12 @@ def measure(settings: Settings, out: Path) -> Outcome:
     difference = np.abs(FOCAL_PX * BASELINE_MM / (truth.disparity - OFFSET_PX) - truth.depth)
     label = "preshifts " + ", ".join(map(str, settings.preshifts_px))
     figures = figures_of("one pass", one, truth) + figures_of(label, merged, truth)
-    notes = (f"f b / (d + {-OFFSET_PX:.3f}) agrees with the true depth: median difference {np.median(difference):.2g} mm",)
+    notes = (
+        f"f b / (d + {-OFFSET_PX:.3f}) agrees with the true depth: median difference {np.median(difference):.2g} mm",
+    )
     pictures = tuple(
-        _picture(out / f"hci-cotton-{name}.png", field, truth) for name, field in (("one-pass", one), ("merged", merged))
+        _picture(out / f"hci-cotton-{name}.png", field, truth)
+        for name, field in (("one-pass", one), ("merged", merged))
     )
     return Outcome(figures, asdict(settings), notes, pictures)
 

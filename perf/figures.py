@@ -19,8 +19,8 @@ Kind = Literal["printed", "goal"]
 class Figure:
     """One measured number.
 
-    ``reference``: the upper limit, a value ``printed`` in the dissertation or a ``goal`` of this project; None where there
-    is none. ``low``: lower limit of a range. ``note``: what else belongs to the number.
+    ``reference``: the upper limit, a value ``printed`` in the dissertation or a ``goal`` of this project; None where
+    there is none. ``low``: lower limit of a range. ``note``: what else belongs to the number.
     """
 
     name: str
@@ -36,7 +36,9 @@ class Figure:
         """Whether the reference is met or beaten; None without one. A value that is not finite never is."""
         if self.reference is None:
             return None
-        return math.isfinite(self.value) and self.value <= self.reference and (self.low is None or self.value >= self.low)
+        return (
+            math.isfinite(self.value) and self.value <= self.reference and (self.low is None or self.value >= self.low)
+        )
 
     def to_json(self) -> dict[str, Any]:
         """The figure as plain values; a value that is not finite becomes None, which JSON can hold."""
@@ -79,7 +81,13 @@ def to_text(name: str, outcome: Outcome, seconds: float) -> str:
     rows = [("", "measured", "reference", "", ""), *(_row(figure) for figure in outcome.figures)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
-        cells = (row[0].ljust(widths[0]), row[1].rjust(widths[1]), row[2].rjust(widths[2]), row[3].ljust(widths[3]), row[4])
+        cells = (
+            row[0].ljust(widths[0]),
+            row[1].rjust(widths[1]),
+            row[2].rjust(widths[2]),
+            row[3].ljust(widths[3]),
+            row[4],
+        )
         lines.append("  ".join(cells).rstrip())
     with_reference = [figure for figure in outcome.figures if figure.met is not None]
     if with_reference:

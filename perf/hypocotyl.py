@@ -1,8 +1,10 @@
-"""A growing seedling, 16 frames of one camera: a flow map to look at, and two lengths that can be checked without truth.
+"""A growing seedling, 16 frames of one camera: a flow map to look at, and two lengths that can be checked without
+truth.
 
-Root tip and hook move up to ten pixels per frame, and the seedling is saturated inside: what moves is its outline. The
-images are therefore binned, so that the motion is about one (binned) pixel per frame. Least squares: in the smooth halo
-around the plant the noise is not what differs between model and image, and total least squares overshoots there.
+Root tip and hook move up to ten pixels per frame, and the seedling is saturated inside: what moves is its outline.
+The images are therefore binned, so that the motion is about one (binned) pixel per frame. Least squares: in the
+smooth halo around the plant the noise is not what differs between model and image, and total least squares overshoots
+there.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ class Found:
 
 
 def _largest(mask: np.ndarray) -> np.ndarray:
-    from scipy.ndimage import label
+    from scipy.ndimage import label  # type: ignore[import-untyped]
 
     parts, _ = label(mask)
     sizes = np.bincount(parts.ravel())
@@ -70,14 +72,22 @@ def estimate_growth(folder: Path, settings: Settings) -> Found:
     height, width = capture.height // size, capture.width // size
     images = np.stack(
         [
-            capture.read(t, 0, 0, 0, height * size, 0, width * size).reshape(height, size, width, size).mean(axis=(1, 3))
+            capture.read(t, 0, 0, 0, height * size, 0, width * size)
+            .reshape(height, size, width, size)
+            .mean(axis=(1, 3))
             for t in range(n)
         ]
     )
     field = estimate(
-        capture_from_array(images[:, None, None]), frame=n // 2, model="flow-affine", window=settings.window, taps=settings.taps,
-        size_time=settings.size_time, estimator=settings.estimator, border=settings.border,
-    )  # fmt: skip
+        capture_from_array(images[:, None, None]),
+        frame=n // 2,
+        model="flow-affine",
+        window=settings.window,
+        taps=settings.taps,
+        size_time=settings.size_time,
+        estimator=settings.estimator,
+        border=settings.border,
+    )
     return Found(images, field.frame, size * vectors(field, "flow", "xy"), field.status)
 
 
@@ -93,11 +103,10 @@ def ends(found: Found, settings: Settings) -> dict[str, tuple[float, float]]:
     for name, last in (("root tip", True), ("hook", False)):
         y = np.array([(r[-1] if last else r[0]) * settings.bin_px for r in rows], dtype=float)
         edge = rows[found.frame][-1 if last else 0]
-        near = np.zeros_like(found.plant)
-        near[edge - depth + 1 : edge + 1] = True if last else False
-        if not last:
-            near[edge : edge + depth] = True
-        result[name] = (float(np.nanmean(found.flow[near & found.plant, 1])), float(np.polyfit(t, y, 1)[0]))
+        first = edge - depth + 1 if last else edge
+        near = found.plant.copy()
+        near[:first] = near[first + depth :] = False
+        result[name] = (float(np.nanmean(found.flow[near, 1])), float(np.polyfit(t, y, 1)[0]))
     return result
 
 
@@ -106,7 +115,10 @@ def measure(settings: Settings, out: Path) -> Outcome:
     found = estimate_growth(out / "hypocotyl", settings)
     figures = []
     for name, (flow, speed) in ends(found, settings).items():
-        figures += [Figure(f"flow along y, {name}", flow, "px/frame"), Figure(f"motion of the {name}", speed, "px/frame")]
+        figures += [
+            Figure(f"flow along y, {name}", flow, "px/frame"),
+            Figure(f"motion of the {name}", speed, "px/frame"),
+        ]
     size = np.hypot(found.flow[..., 0], found.flow[..., 1])
     known = np.isfinite(size) & found.plant
     figures += [
@@ -118,7 +130,7 @@ def measure(settings: Settings, out: Path) -> Outcome:
 
 
 def _picture(path: Path, found: Found) -> Path:
-    y, x = np.nonzero(found.plant)
+    y, x = np.nonzero(_largest(found.images[0] > PLANT) | _largest(found.images[-1] > PLANT))
     margin = 8
     part = slice(max(0, y.min() - margin), y.max() + margin), slice(max(0, x.min() - margin), x.max() + margin)
     arrows = np.where(found.plant[..., None], found.flow, np.nan)

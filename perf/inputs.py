@@ -17,7 +17,8 @@ VARIABLE = "LEAFFLOW_TI_DATA"
 
 
 def data_folder(name: str) -> Path:
-    """Folder of one data set, whether it exists or not: below ``LEAFFLOW_TI_DATA``, else ``shared/data`` beside the checkout."""
+    """Folder of one data set, whether it exists or not: below ``LEAFFLOW_TI_DATA``, else ``shared/data`` beside the
+    checkout."""
     root = os.environ.get(VARIABLE)
     return (Path(root) if root else Path(__file__).parents[2] / "shared" / "data") / name
 

@@ -19,7 +19,8 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One image [y, x], or colours [y, x, 3]. ``limits`` of the colours; ``arrows`` [y, x, 2] drawn on it, NaN where none."""
+    """One image [y, x], or colours [y, x, 3]. ``limits`` of the colours; ``arrows`` [y, x, 2] drawn on it, NaN where
+    none; those three times as long as most are left out."""
 
     title: str
     image: Array
@@ -51,7 +52,9 @@ def draw(path: Path, panels: Sequence[Panel], columns: int, panel_inches: float 
         raise MissingExtra("matplotlib", "plot", "drawing pictures") from None
     rows = -(-len(panels) // columns)
     height, width = panels[0].image.shape[:2]
-    figure = Figure(figsize=(columns * panel_inches, rows * (panel_inches * 0.85 * height / width + 0.3)), layout="constrained")
+    figure = Figure(
+        figsize=(columns * panel_inches, rows * (panel_inches * 0.85 * height / width + 0.3)), layout="constrained"
+    )
     for axes, panel in zip(np.ravel(figure.subplots(rows, columns)), panels, strict=False):
         _draw_panel(figure, axes, panel)
     for axes in figure.axes[len(panels) : rows * columns]:
@@ -73,9 +76,10 @@ def _draw_panel(figure: Any, axes: Any, panel: Panel) -> None:
         step = max(1, max(panel.image.shape[:2]) // 40)
         y, x = np.mgrid[step // 2 : panel.image.shape[0] : step, step // 2 : panel.image.shape[1] : step]
         u, v = panel.arrows[y, x, 0], panel.arrows[y, x, 1]
-        kept = np.isfinite(u + v)
-        longest = np.percentile(np.hypot(u, v)[kept], 98) if kept.any() else 1.0
+        length = np.hypot(u, v)
+        typical = np.nanpercentile(length, 90)
+        kept = length < 3 * typical  # one wild arrow would hide the others
         axes.quiver(
             x[kept], y[kept], u[kept], v[kept],
-            color="#e4442b", angles="xy", scale_units="xy", scale=longest / (2.0 * step), width=0.004,
+            color="#e4442b", angles="xy", scale_units="xy", scale=typical / (2.0 * step), width=0.004,
         )  # fmt: skip

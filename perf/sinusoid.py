@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.capture import Geometry, capture_from_array
+from leafflow_ti.errors import RunError
 from leafflow_ti.metrics import Maps, aae, coverage
 from leafflow_ti.synthetic.plane import PlaneScene, render, sinusoid_scene, truth
 from perf.cases import Options
@@ -25,7 +26,8 @@ TRUE_NAMES = {"depth": "depth", "slope_x": "zx", "slope_y": "zy"}
 
 @dataclass(frozen=True)
 class Settings:
-    """``region_px`` in the middle of the image, every ``stride``-th pixel; ``noise`` in grey values of a range of 100."""
+    """``region_px`` in the middle of the image, every ``stride``-th pixel; ``noise`` in grey values of a range of
+    100."""
 
     size_px: int = 221
     region_px: int = 33
@@ -37,7 +39,9 @@ class Settings:
     seeds: int = 40
 
 
-def estimate_region(plane: PlaneScene, settings: Settings, precision: str) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+def estimate_region(
+    plane: PlaneScene, settings: Settings, precision: str
+) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Maps of the region, and the truth there by the same names as ``truth``."""
     from leafflow_ti.api import estimate
 
@@ -96,16 +100,12 @@ def measure(settings: Settings) -> Outcome:
         Figure(f"AAE of Omega, {label}", means["rotation"], "deg", 0.002),
     ]
     for name in COVERED:
-        values, true, std = (
-            np.stack(maps)
-            for maps in (
-                [m[name] for m, _ in noisy], [_true_map(t, name) for _, t in noisy], [m[f"{name}_std"] for m, _ in noisy]
-            )
-        )  # fmt: skip
-        found_coverage = coverage(values, true, std)
-        if found_coverage is not None:
-            note = f"mean {found_coverage.mean:+.2f}, within 1 std {found_coverage.within_1:.0%}, within 2 {found_coverage.within_2:.0%}"
-            figures.append(Figure(f"std of error over error bar, {name}", found_coverage.std, "", 1.25, low=0.8, note=note))
+        values, std = (np.stack([maps[key] for maps, _ in noisy]) for key in (name, f"{name}_std"))
+        spread = coverage(values, np.stack([_true_map(true, name) for _, true in noisy]), std)
+        if spread is None:
+            raise RunError(f"{name}: no pixel has a value and an error bar; check the window and the preshift")
+        note = f"mean {spread.mean:+.2f}, within 1 std {spread.within_1:.0%}, within 2 {spread.within_2:.0%}"
+        figures.append(Figure(f"std of error over error bar, {name}", spread.std, "", 1.25, low=0.8, note=note))
     return Outcome(tuple(figures), asdict(settings), (f"noise: over {settings.seeds} independent sequences",))
 
 

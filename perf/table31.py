@@ -1,9 +1,9 @@
 """Table 3.1 of the dissertation: depth and slope of a sinusoidal plane from 1D and 2D camera grids.
 
-Printed: Z0 = 100 mm, f = 10 mm, pixel pitch 7.4 µm, ZY = 45°, wavelengths 8 and 80 pixel, the pattern turned by α; noise of
-2.5 % of the grey range. Chosen here, because it is not printed: the camera step, the number of cameras, the window, and
-the region. The integer preshift leaves less than one pixel of the disparity (printed below the table); it is given,
-because a periodic texture does not tell it.
+Printed: Z0 = 100 mm, f = 10 mm, pixel pitch 7.4 µm, ZY = 45°, wavelengths 8 and 80 pixel, the pattern turned by α;
+noise of 2.5 % of the grey range. Chosen here, because it is not printed: the camera step, the number of cameras, the
+window, and the region. The integer preshift leaves less than one pixel of the disparity (printed below the table); it
+is given, because a periodic texture does not tell it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from leafflow_ti.capture import Geometry, capture_from_array
 from leafflow_ti.synthetic.plane import PlaneScene, render, truth
 from perf.cases import Options
 from perf.figures import Figure, Outcome
-
 
 Array = NDArray[np.float64]
 F_PX, DEPTH_MM, RANGE = 10.0 / 0.0074, 100.0, 100.0
@@ -41,8 +40,8 @@ PRINTED: dict[tuple[float, int, str], tuple[float, ...] | None] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """What is chosen here. ``sigma`` is well below a third of the window: where the Gaussian is cut at 1.7 σ, the step at its
-    rim meets the 8-pixel wave, and the slope of the 1D grid at α = 90° varies by .007°."""
+    """What is chosen here. ``sigma`` is well below a third of the window: where the Gaussian is cut at 1.7 σ, the
+    step at its rim meets the 8-pixel wave, and the slope of the 1D grid at α = 90° varies by .007°."""
 
     cameras: int = 9
     baseline_mm: float = 0.5
@@ -106,7 +105,9 @@ def errors(settings: Settings, dimensions: int, plane: PlaneScene, **options: An
 def cell(settings: Settings, dimensions: int, alpha: int, noise_percent: float) -> tuple[Array, Array]:
     """The errors of one cell of the table, over all its seeds."""
     seeds = settings.seeds if noise_percent else 1
-    found = [errors(settings, dimensions, scene(settings, dimensions, alpha, noise_percent, seed)) for seed in range(seeds)]
+    found = [
+        errors(settings, dimensions, scene(settings, dimensions, alpha, noise_percent, seed)) for seed in range(seeds)
+    ]
     return np.concatenate([depth for depth, _ in found]), np.concatenate([slope for _, slope in found])
 
 
@@ -114,7 +115,9 @@ def measure(settings: Settings) -> Outcome:
     """Every cell beside the printed value."""
     figures = []
     for noise, dimensions, alpha in product((0.0, 2.5), (1, 2), settings.alphas):
-        for quantity, unit, values in zip(("Z0", "ZY"), ("mm", "deg"), cell(settings, dimensions, alpha, noise), strict=True):
+        for quantity, unit, values in zip(
+            ("Z0", "ZY"), ("mm", "deg"), cell(settings, dimensions, alpha, noise), strict=True
+        ):
             printed = PRINTED[noise, dimensions, quantity]
             figures.append(
                 Figure(
@@ -126,11 +129,13 @@ def measure(settings: Settings) -> Outcome:
                     note=f"mean error {values.mean():+.2g} {unit}" if values.size else "no pixel has a value",
                 )
             )
-    nearest, farthest = (F_PX * settings.baseline_mm * (1 + s * settings.region_px / 2 / F_PX) / DEPTH_MM for s in (1, -1))
+    nearest, farthest = (
+        F_PX * settings.baseline_mm * (1 + s * settings.region_px / 2 / F_PX) / DEPTH_MM for s in (1, -1)
+    )
     residual = max(abs(nearest + settings.preshift_px), abs(farthest + settings.preshift_px))
     notes = (
         f"residual disparity after the preshift: at most {residual:.2f} px per step in the region",
-        "standard deviation over the region, and over independent noise where there is noise; 1D noisy ZY is not printed",
+        "standard deviation over the region and, with noise, over independent seeds; 1D noisy ZY is not printed",
         "the printed figures come from an unknown, probably much smaller window and grid: compare with that in mind",
     )
     return Outcome(tuple(figures), asdict(settings), notes)
