@@ -185,14 +185,18 @@ class Pipeline:
         status[~inside] = Status.BORDER
         status[~finite] = Status.NOT_FINITE
         status[~kept] = Status.MASKED
-        empty = ~np.isin(status, HAS_VALUE)
         maps = {}
         for name in self.plan.names:
             base = name.removesuffix("_std")
             plane = _plane_of(base, self.plan.problem.columns.solutions) + (Output.STD if name != base else 0)
-            values = planes[plane].astype(np.float32)
+            maps[name] = planes[plane].astype(np.float32)
+        has_value = np.isin(status, HAS_VALUE)
+        for values in maps.values():
+            # A degenerate window can defeat the arithmetic: no NaN without a status that says so.
+            status[has_value & np.isnan(values)] = Status.NOT_CONVERGED
+        empty = ~np.isin(status, HAS_VALUE)
+        for values in maps.values():
             values[empty] = np.nan
-            maps[name] = values
         return maps, status
 
 

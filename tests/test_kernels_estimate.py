@@ -10,6 +10,7 @@ from reference import chain
 from tolerances import SOLVERS, tolerance
 
 from leafflow_ti.models import MODELS
+from leafflow_ti.stages.estimate import DENOISE
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import truth
 
@@ -44,7 +45,7 @@ def test_parameters_equal_the_twin(bench: Callable, case: tuple[str, str, str], 
     for pixel in PIXELS:
         J, rho = b.reference(*pixel)
         P, variance = chain.solve(J, b.columns, b.sampling, estimator)
-        cov = chain.covariances(J, variance, b.columns, b.sampling, rho)
+        cov = chain.covariances(J, variance, b.columns, b.sampling, rho, DENOISE[estimator])
         std = np.sqrt([np.diag(cov[k, k]) for k in range(b.columns.n_time_like)])
         for result in found.values():
             assert result.status[pixel] == Status.OK

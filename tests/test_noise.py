@@ -12,6 +12,7 @@ import pytest
 from reference import chain
 
 from leafflow_ti.models import MODELS, column_set
+from leafflow_ti.stages.estimate import DENOISE
 from leafflow_ti.status import Status
 
 SCENE = replace(
@@ -48,7 +49,9 @@ def estimates(make_bench: Callable, model: str, estimator: str) -> tuple[list[st
         std = []
         for place in PLACES:
             smooth, energy = bench.planes[-2, *place], bench.planes[-3, *place]
-            cov = chain.covariances(bench.tensor(*place), result.variance[place], columns, sampling, smooth / energy)
+            cov = chain.covariances(
+                bench.tensor(*place), result.variance[place], columns, sampling, smooth / energy, DENOISE[estimator]
+            )
             std.append(np.concatenate([np.sqrt(np.diag(cov[k, k])) for k in range(columns.n_time_like)]))
         found.append([result.parameters[place].ravel() for place in PLACES])
         predicted.append(std)

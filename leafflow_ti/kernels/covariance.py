@@ -16,7 +16,7 @@ from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Region, Value, batch
 
 @functools.cache
 def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
-    """The stages ``motion_covariance`` and ``geometry``."""
+    """The stages ``row_covariance`` and ``add_camera``, per solution, and ``geometry``."""
     precise, lanes = spec.precise, spec.lanes
     small = dense(spec)
 
@@ -33,15 +33,61 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def row_covariance(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, solution: ti.i32, rows_at: ti.i32,
-        n_rows: ti.i32, response_at: ti.i32, cov_at: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Packed covariance of the parameters listed at ``rows_at`` of one solution; keeps ``J_ff^-1 E``."""
+        """Packed covariance of the rows of solution ``which``; keeps ``J_ff^-1 E``.
+
+        Most of the gradients' own noise is taken out of J_ff first: where there is nothing else, the variances must
+        grow instead of looking certain.
+        """
         flow = number[Number.FLOW]
-        factor = base + number[Region.TENSOR] * stride
+        n_rows = number[Number.ROWS_S]
+        rows_at = Number.CAMERA_ROWS + which * MAX_ROWS
+        response_at = base + number[Region.RESPONSE_S] * stride
+        cov_at = base + number[Region.COV_S] * stride
+        if which == number[Number.MOTION_SOLUTION]:
+            n_rows = number[Number.ROWS_T]
+            rows_at = Number.MOTION_ROWS
+            response_at = base + number[Region.RESPONSE_T] * stride
+            cov_at = base + number[Region.COV_T] * stride
+        clean = base + number[Region.CLEAN] * stride
         noise = base + number[Region.NOISE] * stride
         product = base + number[Region.PRODUCT] * stride
+        variance = base + (number[Region.VARIANCE] + which) * stride
+        floor = base + number[Region.FLOOR] * stride
+        quietest = ti.Vector.zero(precise, lanes)
+        for j in range(number[Number.SOLUTIONS]):
+            at = base + (number[Region.VARIANCE] + j) * stride
+            for i in range(lanes):
+                quietest[i] = ti.select(j == 0, ws[at + i], ti.min(ws[at + i], quietest[i]))
+        for i in range(lanes):
+            ws[floor + i] = precise(0.0)
+        table = Value.RATIO + which * (flow * (flow + 1) // 2)
+        for r in range(flow):
+            for c in range(r + 1):
+                begin = number[Number.LOWER + tri(r, c)] * n_pixels + pixel
+                s = value[Value.SCALE + r] * value[Value.SCALE + c]
+                ratio = value[table + tri(r, c)]
+                element = ti.Vector.zero(precise, lanes)
+                scaled = ti.Vector.zero(precise, lanes)
+                for i in range(lanes):
+                    element[i] = ti.cast(J[begin + i], precise) * s
+                for i in range(lanes):
+                    scaled[i] = element[i] * ratio
+                small.store(ws, noise + tri(r, c) * stride, scaled)
+                if r == c:
+                    own = value[Value.DENOISE] * value[Value.NOISE + r] * s
+                    for i in range(lanes):
+                        scaled[i] = ws[floor + i] + value[Value.RIDGE] * element[i]
+                    small.store(ws, floor, scaled)
+                    for i in range(lanes):
+                        element[i] -= own * quietest[i]
+                small.store(ws, clean + tri(r, c) * stride, element)
+        least = ti.Vector.zero(precise, lanes)
+        for i in range(lanes):
+            least[i] = ti.max(ws[floor + i] + precise(1e-3) * quietest[i], precise(1e-30))
+        small.store(ws, floor, least)
         for r in range(flow):
             for c in range(n_rows):
                 # p = s p~: the column of the inverse, in the parameter's own units.
@@ -49,19 +95,10 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                 at = response_at + (r * n_rows + c) * stride
                 for i in range(lanes):
                     ws[at + i] = unit
-        small.solve(ws, factor, response_at, flow, n_rows, stride)
-        table = Value.RATIO + solution * (flow * (flow + 1) // 2)
-        for r in range(flow):
-            for c in range(r + 1):
-                begin = number[Number.LOWER + tri(r, c)] * n_pixels + pixel
-                s = value[Value.SCALE + r] * value[Value.SCALE + c] * value[table + tri(r, c)]
-                element = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ti.cast(J[begin + i], precise) * s
-                small.store(ws, noise + tri(r, c) * stride, element)
+        small.cholesky(ws, clean, flow, floor, stride)
+        small.solve(ws, clean, response_at, flow, n_rows, stride)
         small.symmetric_times(ws, noise, response_at, product, flow, n_rows, stride)
         factor_of = texture_smoothness(pixel, n_pixels, number, J)
-        variance = base + (number[Region.VARIANCE] + solution) * stride
         for i in range(lanes):
             factor_of[i] *= ws[variance + i]
         for r in range(n_rows):
@@ -70,17 +107,6 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                 for i in range(lanes):
                     element[i] *= factor_of[i]
                 small.store(ws, cov_at + tri(r, c) * stride, element)
-
-    @ti.func
-    def motion_covariance(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
-    ):  # fmt: skip
-        """Covariance of the rows of the motion solution."""
-        row_covariance(
-            base, pixel, stride, n_pixels, number[Number.MOTION_SOLUTION], Number.MOTION_ROWS, number[Number.ROWS_T],
-            base + number[Region.RESPONSE_T] * stride, base + number[Region.COV_T] * stride, number, value, J, ws,
-        )  # fmt: skip
 
     @ti.func
     def cross_covariance(
@@ -131,7 +157,7 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                 for i in range(lanes):
                     ws[at + i] = unit
         if number[Number.WEIGHTED] == 1:
-            small.cholesky(ws, cov, n_used, stride)
+            small.cholesky(ws, cov, n_used, -1, stride)
             small.solve(ws, cov, work, n_used, terms, stride)
         else:
             spread = base + number[Region.GEOMETRY_SPREAD] * stride
@@ -177,52 +203,49 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                     small.store(ws, at, element)
 
     @ti.func
+    def add_camera(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+    ):  # fmt: skip
+        """Add camera solution ``which`` to the normal equations of the geometry; the first one clears them."""
+        terms, rows_s, rows_t = number[Number.TERMS], number[Number.ROWS_S], number[Number.ROWS_T]
+        if which == 0:
+            for e in range(number[Region.GEOMETRY_COV] - number[Region.GEOMETRY_NORMAL]):
+                for i in range(lanes):
+                    ws[base + (number[Region.GEOMETRY_NORMAL] + e) * stride + i] = precise(0.0)
+            for e in range(terms * rows_t):
+                for i in range(lanes):
+                    ws[base + (number[Region.GEOMETRY_CROSS] + e) * stride + i] = precise(0.0)
+        if number[Number.MOTION_SOLUTION] >= 0:
+            cross_covariance(base, pixel, stride, n_pixels, which, number, value, J, ws)
+        if rows_s > 2 * terms:
+            # The variance of the brightness row, which the next camera solution would overwrite.
+            small.copy(
+                ws, base + (number[Region.COV_S] + tri(rows_s - 1, rows_s - 1)) * stride,
+                base + (number[Region.BRIGHTNESS_VARIANCE] + which) * stride, 1, stride,
+            )  # fmt: skip
+        accumulate(base, stride, which, number, value, ws)
+
+    @ti.func
     def geometry(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Least squares of (nu, b_x, b_y, b_t) per mm over all camera solutions: (3.40), with normals."""
-        terms, rows_t = number[Number.TERMS], number[Number.ROWS_T]
-        first = base + number[Region.GEOMETRY_NORMAL] * stride
-        for e in range(number[Region.GEOMETRY_COV] - number[Region.GEOMETRY_NORMAL]):
-            for i in range(lanes):
-                ws[first + e * stride + i] = precise(0.0)
-        cross = base + number[Region.GEOMETRY_CROSS] * stride
-        for e in range(terms * rows_t):
-            for i in range(lanes):
-                ws[cross + e * stride + i] = precise(0.0)
-        for camera in range(number[Number.CAMERA_SOLUTIONS]):
-            row_covariance(
-                base, pixel, stride, n_pixels, camera, Number.CAMERA_ROWS + camera * MAX_ROWS, number[Number.ROWS_S],
-                base + number[Region.RESPONSE_S] * stride, base + number[Region.COV_S] * stride, number, value, J, ws,
-            )  # fmt: skip
-            if number[Number.MOTION_SOLUTION] >= 0:
-                cross_covariance(base, pixel, stride, n_pixels, camera, number, value, J, ws)
-            brightness_std(base, stride, camera, number, ws)
-            accumulate(base, stride, camera, number, value, ws)
+        terms = number[Number.TERMS]
         normal = base + number[Region.GEOMETRY_NORMAL] * stride
         result = base + number[Region.GEOMETRY] * stride
-        rhs = base + number[Region.GEOMETRY_RHS] * stride
+        cross = base + number[Region.GEOMETRY_CROSS] * stride
         cov = base + number[Region.GEOMETRY_COV] * stride
-        small.cholesky(ws, normal, terms, stride)
-        small.copy(ws, rhs, result, terms, stride)
+        small.cholesky(ws, normal, terms, -1, stride)
+        small.copy(ws, base + number[Region.GEOMETRY_RHS] * stride, result, terms, stride)
         for part in range(2):
             target = ti.select(part == 0, result, cross)
-            small.solve(ws, normal, target, terms, ti.select(part == 0, 1, rows_t), stride)
+            small.solve(ws, normal, target, terms, ti.select(part == 0, 1, number[Number.ROWS_T]), stride)
         if number[Number.WEIGHTED] == 1:
             small.set_identity(ws, cov, terms, stride)
         else:
             small.unpack(ws, base + number[Region.GEOMETRY_SPREAD] * stride, cov, terms, stride)
         small.sandwich(ws, normal, cov, terms, 2 - number[Number.WEIGHTED], stride)
 
-    @ti.func
-    def brightness_std(base: ti.i32, stride: ti.i32, camera: ti.i32, number: ti.template(), ws: ti.template()):
-        """Keep the variance of the brightness row, which the next camera solution would overwrite."""
-        if number[Number.ROWS_S] > 2 * number[Number.TERMS]:
-            last = number[Number.ROWS_S] - 1
-            small.copy(
-                ws, base + (number[Region.COV_S] + tri(last, last)) * stride,
-                base + (number[Region.BRIGHTNESS_VARIANCE] + camera) * stride, 1, stride,
-            )  # fmt: skip
-
-    return SimpleNamespace(**{f.__name__: batch_kernel(spec, f) for f in (motion_covariance, geometry)})
+    return SimpleNamespace(**{f.__name__: batch_kernel(spec, f) for f in (row_covariance, add_camera, geometry)})

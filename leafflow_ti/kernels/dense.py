@@ -27,8 +27,17 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
     tiny = 1e-290 if spec.algebra == "f64" else 1e-36
 
     @ti.func
-    def cholesky(ws: ti.template(), a: ti.i32, n: ti.i32, stride: ti.i32):
-        """Factor the packed matrix at ``a`` in place; the diagonal holds the inverse of the factor's diagonal."""
+    def cholesky(ws: ti.template(), a: ti.i32, n: ti.i32, floor: ti.i32, stride: ti.i32):
+        """Factor the packed matrix at ``a`` in place; the diagonal holds the inverse of the factor's diagonal.
+
+        Pivots are at least the element at ``floor``, or a tiny number if that is negative.
+        """
+        least = ti.Vector.zero(precise, lanes)
+        for i in range(lanes):
+            least[i] = precise(tiny)
+        if floor >= 0:
+            for i in range(lanes):
+                least[i] = ws[floor + i]
         for c in range(n):
             inverse = ti.Vector.zero(precise, lanes)
             for r in range(c, n):
@@ -43,7 +52,7 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                         total[i] -= ws[one + i] * ws[two + i]
                 if r == c:
                     for i in range(lanes):
-                        inverse[i] = 1.0 / ti.sqrt(ti.max(total[i], precise(tiny)))
+                        inverse[i] = 1.0 / ti.sqrt(ti.max(total[i], least[i]))
                     for i in range(lanes):
                         ws[at + i] = inverse[i]
                 else:

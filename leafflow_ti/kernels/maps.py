@@ -58,10 +58,17 @@ def maps_kernel(spec: KernelSpec):
         smooth = ti.cast(J[(number[Number.EXTRA] + 2) * n_pixels + at], precise)
         noise = precise(0.0)
         energy = precise(0.0)
+        lost = 0
         for j in range(number[Number.SOLUTIONS]):
             variance = ws[base + (number[Region.VARIANCE] + j) * stride + i]
             noise += variance / ti.cast(number[Number.SOLUTIONS], precise)
             energy += variance * value[Value.NOISE + number[Number.FLOW] + j]
+            shift = precise(0.0)
+            for column in range(2):
+                p = number[Region.PARAMETERS] + j * number[Number.FLOW] + number[Number.FLOW_ROWS + column]
+                shift += ws[base + p * stride + i] ** 2
+            if not shift < value[Value.MAX_SHIFT] ** 2:
+                lost = 1
         gain = value[Value.GAIN]
         half = (xx + yy) / 2
         weakest = half - ti.sqrt(ti.max(half * half - (xx * yy - xy * xy), precise(0.0)))
@@ -79,11 +86,13 @@ def maps_kernel(spec: KernelSpec):
             result = not_converged
         elif weakest < 2 * noise * gain or weakest < precise(1e-4) * half:
             result = aperture
+        elif lost == 1:
+            result = incoherent
         return result
 
     @ti.func
     def maps(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Write every plane of ``Output`` that the model has."""

@@ -27,7 +27,7 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def load(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """``A = S J S``, packed, with a ridge."""
@@ -54,14 +54,14 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def least_squares(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Factor A; the ordinary least-squares solutions (2.15) become the first vectors, fixed patterns the guards."""
         n, k, flow = number[Number.N], number[Number.SOLUTIONS], number[Number.FLOW]
         factor = base + number[Region.TENSOR] * stride
         vectors = base + number[Region.VECTORS] * stride
-        small.cholesky(ws, factor, n, stride)
+        small.cholesky(ws, factor, n, -1, stride)
         for i in range(lanes):
             ws[base + number[Region.CONVERGED] * stride + i] = precise(0.0)
         for j in range(BLOCK):
@@ -92,15 +92,15 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def factorise(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Factor A alone."""
-        small.cholesky(ws, base + number[Region.TENSOR] * stride, number[Number.N], stride)
+        small.cholesky(ws, base + number[Region.TENSOR] * stride, number[Number.N], -1, stride)
 
     @ti.func
     def accept(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Take the vectors as they are: the solution was direct."""
@@ -143,7 +143,7 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def inverse_iteration(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Rounds of block inverse iteration and Rayleigh-Ritz until all have converged.
@@ -223,7 +223,7 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def jacobi(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Full cyclic Jacobi for the pixels that have no solution yet."""
@@ -247,7 +247,7 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def parameters(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Combine the vectors so that one time-like differential is 1 and the others 0 (section 3.3.2)."""
@@ -273,7 +273,7 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def residuals(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Image noise variance ``p^T J p / p^T C p`` that the residual of each solution amounts to."""

@@ -126,95 +126,61 @@ def patch_fit_kernel(spec: KernelSpec):
 
     @ti.func
     def design(
-        base: ti.i32,
-        pixel: ti.i32,
-        stride: ti.i32,
-        n_rows: ti.i32,
-        number: ti.template(),
-        value: ti.template(),
-        ws: ti.template(),
-    ):
-        """Rows of the system, linearised about the present motion, and their measured values."""
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_rows: ti.i32,
+        number: ti.template(), value: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """Rows of the system, linearised about the present motion, their measured values, and their sensitivity.
+
+        The sensitivity is the derivative of the rows' residual by the geometry, by central differences: variant 0 of
+        the loop is the geometry itself, two more for each of its terms are displaced.
+        """
         flow, terms, offsets = number[Number.FLOW], number[Number.TERMS], number[Number.OFFSETS]
         target = base + number[Region.DESIGN] * stride
         measured = base + number[Region.VALUE] * stride
+        derivative = base + number[Region.DERIVATIVE] * stride
         g = base + number[Region.GEOMETRY] * stride
         q = base + number[Region.MOTION] * stride
-        motion = base + (number[Region.PARAMETERS] + number[Number.MOTION_SOLUTION] * flow) * stride
-        for i in range(lanes):
-            ray = patch.pixel_ray(pixel + i, number, value)
-            b = ti.Vector.zero(precise, 2)
-            if terms > 1:
-                b[0] = ws[g + stride + i]
-                b[1] = ws[g + 2 * stride + i]
-            s = patch.surface(ray, value[Value.F], ws[g + i], b[0], b[1])
-            N = ti.Vector([ws[q + i], ws[q + stride + i], ws[q + 2 * stride + i]], dt=precise)
-            for r in range(n_rows):
-                row = any_row(r, ray, s, N, number, value)
-                for j in ti.static(range(MAX_UNKNOWNS)):
-                    ws[target + (r * MAX_UNKNOWNS + j) * stride + i] = row[j]
-                if r < 2 * offsets:
-                    ws[measured + r * stride + i] = ws[motion + number[Number.MOTION_ROWS + r] * stride + i]
-                else:
-                    ws[measured + r * stride + i] = ws[g + number[Number.RANGE_TERM] * stride + i]
-
-    @ti.func
-    def sensitivity(
-        base: ti.i32,
-        pixel: ti.i32,
-        stride: ti.i32,
-        n_rows: ti.i32,
-        number: ti.template(),
-        value: ti.template(),
-        ws: ti.template(),
-    ):
-        """Derivative of the rows' residual by the geometry, by central differences."""
-        terms = number[Number.TERMS]
-        target = base + number[Region.DERIVATIVE] * stride
-        g = base + number[Region.GEOMETRY] * stride
-        q = base + number[Region.MOTION] * stride
+        parameters = base + (number[Region.PARAMETERS] + number[Number.MOTION_SOLUTION] * flow) * stride
+        for r in range(n_rows):
+            for term in range(terms):
+                own = ti.cast(r == 2 * offsets and term == number[Number.RANGE_TERM], precise)
+                for i in range(lanes):
+                    ws[derivative + (r * terms + term) * stride + i] = own
         for i in range(lanes):
             ray = patch.pixel_ray(pixel + i, number, value)
             motion = ti.Vector.zero(precise, MAX_UNKNOWNS)
             for j in ti.static(range(MAX_UNKNOWNS)):
                 motion[j] = ws[q + j * stride + i]
             N = ti.Vector([motion[0], motion[1], motion[2]], dt=precise)
-            b = ti.Vector.zero(precise, 2)
-            if terms > 1:
-                b[0] = ws[g + stride + i]
-                b[1] = ws[g + 2 * stride + i]
-            nu = ws[g + i]
-            for term in range(terms):
-                h = value[Value.STEP_SIZE] * ti.abs(nu)
-                up = ti.Vector.zero(precise, 3)
-                if term == 0:
-                    up[0] = h
-                elif term == 1:
+            for variant in range(1 + 2 * ti.min(terms, 3)):
+                term = (variant - 1) // 2
+                nu = ws[g + i]
+                h = value[Value.STEP_SIZE] * ti.abs(nu) * (1.0 - 2.0 * ti.cast(variant % 2, precise))
+                if term > 0:
                     h /= value[Value.F]
-                    up[1] = h
-                elif term == 2:
-                    h /= value[Value.F]
-                    up[2] = h
+                b = ti.Vector.zero(precise, 2)
+                if terms > 1:
+                    b[0] = ws[g + stride + i] + ti.select(term == 1, h, precise(0.0))
+                    b[1] = ws[g + 2 * stride + i] + ti.select(term == 2, h, precise(0.0))
+                if variant > 0 and term == 0:
+                    nu += h
+                s = patch.surface(ray, value[Value.F], nu, b[0], b[1])
                 for r in range(n_rows):
-                    change = ti.cast(r == 2 * number[Number.OFFSETS] and term == number[Number.RANGE_TERM], precise)
-                    if term < 3:
-                        for side in range(2):
-                            sign = ti.select(side == 0, precise(1.0), precise(-1.0))
-                            s = patch.surface(
-                                ray, value[Value.F], nu + sign * up[0], b[0] + sign * up[1], b[1] + sign * up[2]
-                            )
-                            change -= sign * any_row(r, ray, s, N, number, value).dot(motion) / (2 * h)
-                    ws[target + (r * terms + term) * stride + i] = change
+                    row = any_row(r, ray, s, N, number, value)
+                    if variant == 0:
+                        for j in ti.static(range(MAX_UNKNOWNS)):
+                            ws[target + (r * MAX_UNKNOWNS + j) * stride + i] = row[j]
+                    else:
+                        ws[derivative + (r * terms + term) * stride + i] -= row.dot(motion) / (2 * h)
+            for r in range(n_rows):
+                at = g + number[Number.RANGE_TERM] * stride
+                if r < 2 * offsets:
+                    at = parameters + number[Number.MOTION_ROWS + r] * stride
+                ws[measured + r * stride + i] = ws[at + i]
 
     @ti.func
     def row_spread(
-        base: ti.i32,
-        stride: ti.i32,
-        n_rows: ti.i32,
-        first: ti.i32,
-        number: ti.template(),
-        value: ti.template(),
-        ws: ti.template(),
+        base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
     ):
         """Covariance of the rows: for the weights without, for the error bars with what motion and geometry share."""
         terms, rows_t, used = number[Number.TERMS], number[Number.ROWS_T], 2 * number[Number.OFFSETS]
@@ -230,29 +196,22 @@ def patch_fit_kernel(spec: KernelSpec):
                     own = cov_t + tri(r, c) * stride
                     for i in range(lanes):
                         spread[i] = ws[own + i]
-                if first == 1:
-                    if r == used and c == used:
-                        term = number[Number.RANGE_TERM]
-                        own = cov_g + (term * terms + term) * stride
+                for a in range(terms):
+                    da = d + (r * terms + a) * stride
+                    db = d + (c * terms + a) * stride
+                    for b in range(terms):
+                        dc = d + (c * terms + b) * stride
+                        own = cov_g + (a * terms + b) * stride
                         for i in range(lanes):
-                            spread[i] = ws[own + i]
-                else:
-                    for a in range(terms):
-                        da = d + (r * terms + a) * stride
-                        db = d + (c * terms + a) * stride
-                        for b in range(terms):
-                            dc = d + (c * terms + b) * stride
-                            own = cov_g + (a * terms + b) * stride
-                            for i in range(lanes):
-                                spread[i] += ws[da + i] * ws[own + i] * ws[dc + i]
-                        if c < used:
-                            own = cross + (a * rows_t + c) * stride
-                            for i in range(lanes):
-                                shared[i] += ws[da + i] * ws[own + i]
-                        if r < used:
-                            own = cross + (a * rows_t + r) * stride
-                            for i in range(lanes):
-                                shared[i] += ws[db + i] * ws[own + i]
+                            spread[i] += ws[da + i] * ws[own + i] * ws[dc + i]
+                    if c < used:
+                        own = cross + (a * rows_t + c) * stride
+                        for i in range(lanes):
+                            shared[i] += ws[da + i] * ws[own + i]
+                    if r < used:
+                        own = cross + (a * rows_t + r) * stride
+                        for i in range(lanes):
+                            shared[i] += ws[db + i] * ws[own + i]
                 for i in range(lanes):
                     shared[i] += spread[i]
                 small.store(ws, base + (number[Region.TOTAL] + tri(r, c)) * stride, shared)
@@ -280,19 +239,19 @@ def patch_fit_kernel(spec: KernelSpec):
                 small.copy(ws, a + (r * MAX_UNKNOWNS + c) * stride, weighted + (r * n + c) * stride, 1, stride)
         if number[Number.WEIGHTED] == 1:
             small.copy(ws, base + number[Region.SPREAD] * stride, factor, n_rows * (n_rows + 1) // 2, stride)
-            small.cholesky(ws, factor, n_rows, stride)
+            small.cholesky(ws, factor, n_rows, -1, stride)
             small.solve(ws, factor, weighted, n_rows, n, stride)
         for r in range(n):
             for c in range(r + 1):
                 element = small.dot(ws, a + r * stride, MAX_UNKNOWNS, weighted + c * stride, n, n_rows, stride)
                 small.store(ws, normal + tri(r, c) * stride, element)
             small.store(ws, q + r * stride, small.dot(ws, weighted + r * stride, n, v, 1, n_rows, stride))
-        small.cholesky(ws, normal, n, stride)
+        small.cholesky(ws, normal, n, -1, stride)
         small.solve(ws, normal, q, n, 1, stride)
 
     @ti.func
     def patch_fit(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
         """Motion and covariance; each pass takes Ω × N and the rows' covariance from the one before."""
@@ -302,12 +261,10 @@ def patch_fit_kernel(spec: KernelSpec):
         for j in range(MAX_UNKNOWNS):
             for i in range(lanes):
                 ws[q + j * stride + i] = precise(0.0)
-        row_spread(base, stride, n_rows, 1, number, value, ws)
         for _ in range(number[Number.PASSES]):
             design(base, pixel, stride, n_rows, number, value, ws)
+            row_spread(base, stride, n_rows, number, value, ws)
             solve(base, stride, n_rows, number, ws)
-            sensitivity(base, pixel, stride, n_rows, number, value, ws)
-            row_spread(base, stride, n_rows, 0, number, value, ws)
         weighted = base + number[Region.WEIGHTED] * stride
         total = base + number[Region.TOTAL] * stride
         work = base + number[Region.MOTION_WORK] * stride

@@ -36,6 +36,8 @@ class Region(IntEnum):
     CONVERGED = auto()  # [1]
     PARAMETERS = auto()  # [k, F]
     VARIANCE = auto()  # [k]: image noise variance of each residual
+    CLEAN = auto()  # packed [F]: J_ff without the noise of the gradients, then its factor
+    FLOOR = auto()  # [1]: least pivot of that factor
     NOISE = auto()  # packed [F]: noise of the normal equations
     RESPONSE_S = auto()  # [F, S]: inverse of J_ff for the geometry rows
     RESPONSE_T = auto()  # [F, T]: for the motion rows
@@ -97,6 +99,8 @@ class Layout:
             Region.CONVERGED: 1,
             Region.PARAMETERS: k * flow,
             Region.VARIANCE: k,
+            Region.CLEAN: packed(flow),
+            Region.FLOOR: 1,
             Region.NOISE: packed(flow),
             Region.RESPONSE_S: flow * s,
             Region.RESPONSE_T: flow * t,
@@ -181,12 +185,14 @@ class Value(IntEnum):
     BASELINE = auto()  # 2
     SHIFT = BASELINE + 2  # 2: disparity that the preshift and the rectification took out, px per step
     STEP_SIZE = SHIFT + 2  # relative step of the finite differences in the motion fit
+    DENOISE = auto()  # share of the gradients' noise that is taken out of J_ff in the covariances
     RANGE_CAUTION = auto()  # factor of the standard error of b_t in the weights
     GAIN = auto()  # noise gain of the gradient: x and y
     MIN_MASS = auto()
     MIN_STRUCTURE = auto()  # least gradient energy per energy of the image
     ROUGHEST = auto()  # share of the gradient's energy that one more smoothing leaves, below which it is noise
     MAX_RESIDUAL = auto()  # px, for status incoherent
+    MAX_SHIFT = auto()  # px per step or frame, likewise
     GAP = auto()  # convergence: residual per gap
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
@@ -196,10 +202,10 @@ class Value(IntEnum):
 
 @functools.cache
 def batch_kernel(spec: KernelSpec, body):
-    """A kernel: ``body(base, pixel, stride, n_pixels, number, value, J, ws, out)`` for every group of a batch.
+    """A kernel: ``body(base, pixel, stride, n_pixels, which, number, value, J, ws, out)`` for every group of a batch.
 
     ``base``: the group's place in the workspace; ``pixel``: its first pixel; ``stride``: distance of workspace
-    elements.
+    elements; ``which``: index of the solution that the stage is about, where that matters.
     """
     real, precise, lanes = spec.real, spec.precise, spec.lanes
 
@@ -210,6 +216,7 @@ def batch_kernel(spec: KernelSpec, body):
         n_groups: ti.i32,
         group_step: ti.i32,
         stride: ti.i32,
+        which: ti.i32,
         n_tasks: ti.i32,
         number_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [Number.LOWER + N (N + 1) / 2]
         value_in: ti.types.ndarray(dtype=precise, ndim=1),  # [Value.RATIO + k F (F + 1) / 2]
@@ -220,14 +227,15 @@ def batch_kernel(spec: KernelSpec, body):
         if ti.static(spec.gpu):
             for g in range(n_groups):
                 body(
-                    g * group_step, first_pixel + g * lanes, stride, n_pixels, number_in, value_in, J_in, ws_io, map_out
-                )
+                    g * group_step, first_pixel + g * lanes, stride, n_pixels, which,
+                    number_in, value_in, J_in, ws_io, map_out,
+                )  # fmt: skip
         else:
             for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
                 if part == 0:
                     for g in range(task * n_groups // n_tasks, (task + 1) * n_groups // n_tasks):
                         body(
-                            g * group_step, first_pixel + g * lanes, stride, n_pixels,
+                            g * group_step, first_pixel + g * lanes, stride, n_pixels, which,
                             number_in, value_in, J_in, ws_io, map_out,
                         )  # fmt: skip
 

@@ -19,6 +19,13 @@ BATCH_BYTES = 8 << 20
 """Workspace of one batch of pixels: it should stay in the processor's cache."""
 RIDGE = {"f64": 1e-13, "f32": 1e-7}
 GAP = {"f64": 1e-6, "f32": 1e-3}
+DENOISE = {"ols": 0.0, "tls": 0.0, "tls-equilibrated": 0.9}
+"""Share of the gradients' own noise that the covariances take out of J_ff; OLS divides by J_ff as it is, and the
+residual of raw TLS is no bound for the eigenvalues of the equilibrated tensor.
+
+What noise adds to J_ff is no structure. Taking nearly all of it leaves the matrix definite where there is nothing else,
+and makes the standard errors there ten times larger.
+"""
 RANGE_CAUTION = 3.0
 """Factor of the standard error of b_t in the weights of the motion fit.
 
@@ -117,6 +124,7 @@ class EstimateStage:
         itemsize = np.dtype(device.real("algebra")).itemsize
         per_group = self.layout.n_elements * lanes * itemsize
         self._groups = max(1, min(n_pixels // lanes, BATCH_BYTES // per_group if not device.gpu else 1 << 15))
+        self._batch_groups = 0
         self._workspace = device.empty(self._groups * self.layout.n_elements * lanes, "algebra")
         from leafflow_ti.kernels.maps import Output
 
@@ -174,6 +182,9 @@ class EstimateStage:
         value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
         value[Value.RANGE_CAUTION] = RANGE_CAUTION
+        # Content that leaves the window from one frame to the next cannot be followed.
+        value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size) // 2
+        value[Value.DENOISE] = DENOISE[problem.estimator]
         lower = np.tril_indices(columns.n_flow)
         ratios = [noise_ratio(sampling, columns, a)[lower] for a in columns.solutions]
         value[Value.RATIO :] = np.concatenate(ratios)
@@ -211,6 +222,16 @@ class EstimateStage:
         raw[Value.SCALE : Value.SCALE + MAX_COLUMNS] = 1.0
         return self.device.array(raw, "algebra")
 
+    def unsolved(self) -> bool:
+        """Whether pixels of the present batch have no null space yet; on a GPU always, a look would cost more."""
+        if self.device.gpu:
+            return True
+        from leafflow_ti.kernels.workspace import Region
+
+        shape = (-1, self.layout.n_elements, self.device.dense.lanes)
+        solved = self._workspace.reshape(shape)[: self._batch_groups, self.layout.offsets[Region.CONVERGED]]
+        return bool((solved < 0.5).any())
+
     def __call__(self, tensor: Any) -> NDArray[Any]:
         """The planes of ``Output`` as a NumPy array [planes, rows, cols]."""
         from leafflow_ti.kernels.covariance import covariance_kernels
@@ -226,16 +247,22 @@ class EstimateStage:
             groups = min(self._groups, n_pixels // lanes - first)
             step, stride = (self.layout.n_elements * lanes, lanes) if not device.gpu else (1, groups)
 
-            def launch(kernel: Any, value: Any = None, *, at: Any = (first, groups, step, stride)) -> None:
+            def launch(
+                kernel: Any, value: Any = None, *, which: int = 0, at: Any = (first, groups, step, stride)
+            ) -> None:
                 first, groups, step, stride = at
                 kernel(
-                    first * lanes, n_pixels, groups, step, stride, device.tasks(groups), self._number,
+                    first * lanes, n_pixels, groups, step, stride, which, device.tasks(groups), self._number,
                     self._value if value is None else value, tensor, self._workspace, self._maps,
                 )  # fmt: skip
 
+            self._batch_groups = groups
             solve(launch)
             if "t" in problem.columns.solutions:
-                launch(covariance.motion_covariance)
+                launch(covariance.row_covariance, which=problem.columns.n_time_like - 1)
+            for camera in range(len(problem.camera_axes)):
+                launch(covariance.row_covariance, which=camera)
+                launch(covariance.add_camera, which=camera)
             if problem.camera_axes:
                 launch(covariance.geometry)
             if problem.unknowns:

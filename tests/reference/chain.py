@@ -96,10 +96,14 @@ def noise_variance(J, P, columns: ColumnSet, noise):
     return np.einsum("ik,ij,jk->k", full, J, full) / np.einsum("ik,i,ik->k", full, noise, full)
 
 
-def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0):
-    """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions."""
+def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, denoise=0.9):
+    """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions.
+
+    ``denoise``: the share of the noise of its own columns, at the variance of the quietest solution, that J_ff loses.
+    """
     n, k = columns.n_flow, columns.n_time_like
-    inverse = np.linalg.inv(J[:n, :n])
+    noise = np.diag(column_noise(sampling, columns)[:n])
+    inverse = np.linalg.inv(J[:n, :n] - denoise * np.min(variances) * noise)
     cov = np.zeros((k, k, n, n))
     for i, one in enumerate(columns.solutions):
         for j, two in enumerate(columns.solutions):
@@ -239,15 +243,12 @@ def fit_motion(
     value = P[rows, k]
     base = cov[k, k][np.ix_(rows, rows)]
     cross = cross[:, rows]
-    spread = base
     factors = [1.0] * (2 * len(offsets)) + [caution] * use_range
     if use_range:
         it = names.index("t")
         value = np.append(value, g[it])
         base = np.pad(base, ((0, 1), (0, 1)))
         cross = np.pad(cross, ((0, 0), (0, 1)))
-        spread = base.copy()
-        spread[-1, -1] = cov_g[it, it]
 
     def design(geometry, q):
         A = motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline)
@@ -258,9 +259,6 @@ def fit_motion(
     surface_terms[: min(3, len(g))] = g[:3]
     for _ in range(passes):
         A = design(surface_terms, q)
-        W = np.linalg.inv(spread * np.outer(factors, factors)) if weighted else np.eye(len(value))
-        G = np.linalg.solve(A.T @ W @ A, A.T @ W)
-        q = G @ value
         D = np.zeros((len(value), len(g)))
         for i in range(min(3, len(g))):
             step = np.zeros(3)
@@ -270,6 +268,9 @@ def fit_motion(
             D[-1, it] += 1.0
         spread = base + D @ cov_g @ D.T
         total = spread + D @ cross + cross.T @ D.T
+        W = np.linalg.inv(spread * np.outer(factors, factors)) if weighted else np.eye(len(value))
+        G = np.linalg.solve(A.T @ W @ A, A.T @ W)
+        q = G @ value
     return q, G @ total @ G.T
 
 
@@ -287,7 +288,7 @@ def measure(J, rho, problem, view, x, y):
     """Every map of one pixel (x, y): name -> (value, standard error). ``problem``, ``view``: what the stages get."""
     columns, sampling = problem.columns, problem.sampling
     P, variance = solve(J, columns, sampling, problem.estimator)
-    cov = covariances(J, variance, columns, sampling, rho)
+    cov = covariances(J, variance, columns, sampling, rho, estimate.DENOISE[problem.estimator])
     x0, y0, f = x - view.principal_px[0], y - view.principal_px[1], view.f_px
     found = {}
     for k, axis in enumerate(columns.solutions):

@@ -33,8 +33,9 @@ def _null_space(stage: Any, value: Any) -> Solve:
         launch(kernels.least_squares, value)
         if stage.problem.solver == "fast":
             launch(kernels.inverse_iteration, value)
-        # All pixels, or those whose gap is too small for the iteration.
-        launch(kernels.jacobi, value)
+        if stage.unsolved():
+            # All pixels, or those whose gap is too small for the iteration.
+            launch(kernels.jacobi, value)
         launch(kernels.parameters, value)
         if value is not None:
             # Residuals and covariances are worked out on the equilibrated tensor.
