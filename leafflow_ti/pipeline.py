@@ -63,6 +63,8 @@ class Pipeline:
         self.timings = Timings()
         self._engines: dict[int, _Engine] = {}
         self._mask = _read_mask(plan.config.output.mask, capture)
+        self._rows = self._measurable("y", plan.y, capture.height, 1)
+        self._cols = self._measurable("x", plan.x, capture.width, 0)
 
     def warm_up(self) -> float:
         """Compile every kernel of the plan on a tiny band; the seconds that it took."""
@@ -91,35 +93,59 @@ class Pipeline:
         plan = self.plan
         tensor = TensorStage(self.device, plan.problem.columns, plan.layout, plan.problem.sampling, band)
         return _Engine(
-            tensor, EstimateStage(self.device, plan.problem, plan.layout, self._view(0, band, tensor.out_pitch))
+            tensor, EstimateStage(self.device, plan.problem, plan.layout, self._view((0, 0), band, tensor.out_pitch))
         )
 
-    def _view(self, first_row: int, band: Band, pitch: int) -> View:
+    def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
+        """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.
+
+        ``pair``: where the axis stands in pairs (x, y); cameras are (rows, columns).
+        """
+        plan = self.plan
+        reach = plan.problem.sampling.axis(axis).radius if plan.config.window.border == "full" else 0
+        shifts = [plan.preshift[pair] * (k - self.capture.reference[1 - pair]) for k in plan.cameras[1 - pair]]
+        first, last = reach - min(shifts), size - 1 - reach - max(shifts)
+        inside = [i for i, p in enumerate(positions) if first <= p <= last]
+        return slice(inside[0], inside[-1] + 1) if inside else slice(0, 0)
+
+    def _view(self, corner: tuple[int, int], band: Band, pitch: int) -> View:
+        """The output grid whose first pixel is (row, column) ``corner`` of the plan."""
         plan, geometry = self.plan, self.plan.geometry
         offset = geometry.disparity_offset_px
         shift = (plan.preshift[0] + offset[0], plan.preshift[1] + offset[1])
         return View(
             geometry.f_px, geometry.principal_px, geometry.baseline_mm, shift,
-            plan.x.start, plan.y[first_row], plan.x.step, band.rows, band.cols, pitch,
+            plan.x[corner[1]], plan.y[corner[0]], plan.x.step, band.rows, band.cols, pitch,
         )  # fmt: skip
 
     def _sequence(self, index: int, first: int, last: int) -> Iterator[tuple[Unit, Maps, NDArray[np.uint8]]]:
-        """The units of one band for the output frames first..last, sliding through the sequence."""
+        """The units of one band for the output frames first..last, sliding through the sequence.
+
+        Only the rectangle of measurable pixels is computed; what lies around it is border.
+        """
         plan = self.plan
-        rows = plan.band(index)
-        band = Band.of(plan.problem.sampling, rows.stop - rows.start, len(plan.x), plan.config.window.stride)
+        whole = plan.band(index)
+        rows = slice(max(whole.start, self._rows.start), min(whole.stop, self._rows.stop))
+        cols = self._cols
+        if rows.start >= rows.stop or cols.start >= cols.stop:
+            for t_index in range(first, last + 1):
+                yield plan.unit(t_index, index), *self._frame_of(whole, {}, None, None)
+            return
+        band = Band.of(plan.problem.sampling, rows.stop - rows.start, cols.stop - cols.start, plan.x.step)
         if band.rows not in self._engines:
             self._engines[band.rows] = self._make_engine(band)
         engine = self._engines[band.rows]
         engine.tensor.reset()
-        engine.estimate.set_view(self._view(rows.start, band, engine.tensor.out_pitch))
-        inside, kept = self._inside(band, rows.start)
-        measurable = self._measurable(band, inside)
+        engine.estimate.set_view(self._view((rows.start, cols.start), band, engine.tensor.out_pitch))
+        corner = (plan.y[rows.start] - band.halo_y, plan.x[cols.start] - band.halo_x)
+        inside, kept = self._inside(band, corner)
+        centre = _centres(band)
+        place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
         latency = engine.tensor.latency
         finite: dict[int, NDArray[np.bool_]] = {}
         for t in range(plan.frames[first] - latency, plan.frames[last] + latency + 1):
             with self.timings.of("read"):
-                block, finite[t] = self._read(t, band, rows.start)
+                block, finite[t] = self._read(t, band, corner)
             with self.timings.of("tensor"):
                 tensor = engine.tensor.push(block, inside & kept & finite[t])
                 self.device.synchronize()
@@ -128,15 +154,33 @@ class Pipeline:
             if tensor is None:
                 continue
             with self.timings.of("estimate"):
-                planes = engine.estimate(tensor)
+                maps, status = self._maps(engine.estimate(tensor), finite[frame][centre])
                 unit = plan.unit(first + frame - plan.frames[first], index)
-                centre = _centres(band)
-                maps, status = self._maps(planes, measurable, kept[centre], finite[frame][centre])
-            yield unit, maps, status
+                result = self._frame_of(whole, maps, status, place)
+            yield unit, *result
 
-    def _read(self, t: int, band: Band, first_row: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    def _frame_of(
+        self, rows: slice, maps: Maps, status: NDArray[np.uint8] | None, place: tuple[slice, slice] | None
+    ) -> tuple[Maps, NDArray[np.uint8]]:
+        """The measured rectangle at ``place`` within the unit's rows; border around it, masked where the mask says."""
+        plan = self.plan
+        shape = (rows.stop - rows.start, len(plan.x))
+        codes = np.full(shape, Status.BORDER, np.uint8)
+        framed = {name: np.full(shape, np.nan, np.float32) for name in plan.names}
+        if place is not None and status is not None:
+            codes[place] = status
+        if self._mask is not None:
+            codes[~self._mask[np.ix_(plan.y[rows], plan.x)]] = Status.MASKED
+        if place is not None:
+            empty = ~np.isin(codes[place], HAS_VALUE)
+            for name, values in maps.items():
+                values[empty] = np.nan
+                framed[name][place] = values
+        return framed, codes
+
+    def _read(self, t: int, band: Band, corner: tuple[int, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Preshifted block [sy, sx, in_rows, in_cols] with non-finite values replaced by 0, and where it was finite."""
-        y0, x0 = self.plan.y[first_row] - band.halo_y, self.plan.x.start - band.halo_x
+        y0, x0 = corner
         block = self.capture.block(
             [t], *self.plan.cameras, y0, y0 + band.in_rows, x0, x0 + band.in_cols, self.plan.preshift,
             self.device.real("storage"),
@@ -146,11 +190,10 @@ class Pipeline:
             return block, np.ones(block.shape[2:], bool)
         return np.where(finite, block, 0), finite.all(axis=(0, 1))
 
-    def _inside(self, band: Band, first_row: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _inside(self, band: Band, corner: tuple[int, int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Where every camera sees its image, and where the mask allows a measurement: [in_rows, in_cols]."""
         plan, capture = self.plan, self.capture
-        y = plan.y[first_row] - band.halo_y + np.arange(band.in_rows)
-        x = plan.x.start - band.halo_x + np.arange(band.in_cols)
+        y, x = corner[0] + np.arange(band.in_rows), corner[1] + np.arange(band.in_cols)
         in_y, in_x = np.ones(y.size, bool), np.ones(x.size, bool)
         for k in plan.cameras[0]:
             shifted = y + plan.preshift[1] * (k - capture.reference[0])
@@ -164,27 +207,12 @@ class Pipeline:
         kept = self._mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
         return inside, kept
 
-    def _measurable(self, band: Band, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Output pixels [rows, cols] that lie, with their whole window if it must be full, inside all images."""
-        if self.plan.config.window.border == "full":
-            for axis, plan in enumerate((self.plan.problem.sampling.y, self.plan.problem.sampling.x)):
-                along = inside.any(axis=1 - axis)
-                outside = np.concatenate([[0], np.cumsum(~along)])
-                reach = np.arange(along.size)
-                first, last = np.maximum(reach - plan.radius, 0), np.minimum(reach + plan.radius + 1, along.size)
-                inside = inside & np.expand_dims(outside[last] == outside[first], 1 - axis)
-        return inside[_centres(band)]
-
-    def _maps(
-        self, planes: NDArray[Any], inside: NDArray[np.bool_], kept: NDArray[np.bool_], finite: NDArray[np.bool_]
-    ) -> tuple[Maps, NDArray[np.uint8]]:
-        """Named maps, NaN where there is no value, and the status that says why."""
+    def _maps(self, planes: NDArray[Any], finite: NDArray[np.bool_]) -> tuple[Maps, NDArray[np.uint8]]:
+        """Named maps and the status of the measured rectangle."""
         from leafflow_ti.kernels.maps import Output
 
         status = planes[Output.STATUS].astype(np.uint8)
-        status[~inside] = Status.BORDER
         status[~finite] = Status.NOT_FINITE
-        status[~kept] = Status.MASKED
         maps = {}
         for name in self.plan.names:
             base = name.removesuffix("_std")
@@ -194,9 +222,6 @@ class Pipeline:
         for values in maps.values():
             # A degenerate window can defeat the arithmetic: no NaN without a status that says so.
             status[has_value & np.isnan(values)] = Status.NOT_CONVERGED
-        empty = ~np.isin(status, HAS_VALUE)
-        for values in maps.values():
-            values[empty] = np.nan
         return maps, status
 
 
