@@ -16,6 +16,7 @@ import leafflow_ti as lf
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import RunConfig, load_config
 from leafflow_ti.progress import Progress
+from leafflow_ti.stages.tensor import OUTPUT_PLANES
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import PlaneScene, render, truth
 
@@ -172,3 +173,10 @@ def test_stated_disparity_offset_is_part_of_the_depth() -> None:
     assert ok.sum() > 100
     depth = truth(scene)["depth"][::2, ::2]
     assert np.max(np.abs(field["depth"][ok] / depth[ok] - 1)) < 2e-3
+
+
+def test_plan_counts_every_output_plane() -> None:
+    # The plan is made without the engine, so it cannot ask the kernels.
+    from leafflow_ti.kernels.maps import Output
+
+    assert Output.PLANES == OUTPUT_PLANES

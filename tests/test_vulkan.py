@@ -59,7 +59,7 @@ def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
 
 def on_vulkan_filtering_is_correlation(device: Callable) -> None:
     """The plane kernel alone: shifts, weights, strides and a displaced target."""
-    from leafflow_ti.stages.tensor import Filtering
+    from leafflow_ti.stages.planes import Filtering
 
     d = device("f32")
     random = np.random.default_rng(1)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
+from leafflow_ti.stages.planes import Filtering, Terms, round_up
 
 EXTRA_PLANES = 4
 """Behind the tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
@@ -60,21 +61,6 @@ class Band:
         return (self.cols - 1) * self.stride + 1 + 2 * self.halo_x
 
 
-@dataclass
-class Terms:
-    """A sparse table: for each output plane, a list of (offset or pair of planes, weight)."""
-
-    first: list[int]
-    source: list[Any]
-    weight: list[float]
-
-    @classmethod
-    def of(cls, outputs: list[list[tuple[Any, float]]]) -> Terms:
-        """From one list of terms per output plane."""
-        first = np.cumsum([0] + [len(o) for o in outputs]).tolist()
-        return cls(first, [s for o in outputs for s, _ in o], [w for o in outputs for _, w in o])
-
-
 def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int) -> int:
     """Memory of the arrays of one band, from raw frames to output maps."""
     cameras = (2 * sampling.sy.radius + 1) * (2 * sampling.sx.radius + 1)
@@ -101,42 +87,6 @@ def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, ban
     return itemsize * (
         wide * band.in_rows * pitch + (len(tall) + extra) * band.rows * pitch + output * band.rows * out_pitch
     )
-
-
-class Filtering:
-    """One launch of the plane filter with its tables on the device."""
-
-    def __init__(
-        self,
-        device: Device,
-        outputs: list[list[tuple[int, float]]],
-        rows: int,
-        pitch: int,
-        row_step: int,
-        col_step: int = 1,
-    ):
-        terms = Terms.of(outputs)
-        self.device, self.rows, self.pitch, self.row_step, self.col_step = device, rows, pitch, row_step, col_step
-        self.n_planes = len(outputs)
-        self.size = self.n_planes * rows * pitch
-        self._tables = (
-            device.array(terms.first, "int"), device.array(terms.source, "int"), device.array(terms.weight),
-        )  # fmt: skip
-
-    def __call__(self, src: Any, dst: Any, to: int = 0) -> None:
-        """``dst`` gets ``n_planes`` planes of [rows, pitch] from element ``to`` on."""
-        from leafflow_ti.kernels.planes import filter_planes_kernel
-
-        spec = self.device.planes
-        groups = self.n_planes * self.rows * self.pitch // spec.lanes
-        filter_planes_kernel(spec, self.col_step)(
-            self.n_planes, self.rows, self.pitch, self.row_step, to, self.device.tasks(groups), *self._tables, src, dst
-        )  # fmt: skip
-
-
-def round_up(n: int, multiple: int) -> int:
-    """The next multiple."""
-    return -(-n // multiple) * multiple
 
 
 class TensorStage:
