@@ -48,6 +48,8 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
     if frame is None:
         middle = plan.frames[len(plan.frames) // 2]
         return estimate(capture, middle, **options)
+    from leafflow_ti.kernels.engine import quick_front_end
+
     device = _start(config)
     pipeline = Pipeline(plan, capture, device)
     shape = (len(plan.y), len(plan.x))
@@ -59,7 +61,8 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
             maps[name][unit.rows] = values
         status[unit.rows] = codes
 
-    pipeline.run(set(), deliver)
+    with quick_front_end():
+        pipeline.run(set(), deliver)
     attrs = {**_provenance(plan, capture, device), "stage_seconds": pipeline.timings.seconds}
     return Field(maps, status, np.array(plan.y), np.array(plan.x), plan.frames[0], attrs)
 

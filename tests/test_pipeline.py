@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import os
 import subprocess
 import sys
@@ -180,3 +181,13 @@ def test_plan_counts_every_output_plane() -> None:
     from leafflow_ti.kernels.maps import Output
 
     assert Output.PLANES == OUTPUT_PLANES
+
+
+def test_front_end_of_the_engine_is_left_as_it_was() -> None:
+    from leafflow_ti.kernels.engine import ENGINE, quick_front_end
+
+    front_end = importlib.import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
+    usual = front_end.TextWrapper
+    with quick_front_end():
+        assert front_end.TextWrapper is not usual
+    assert front_end.TextWrapper is usual
