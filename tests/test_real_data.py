@@ -56,8 +56,7 @@ def test_light_field_is_measured_up_to_its_borders_and_better_with_three_preshif
     medians = []
     for field in (fields[1], merged):
         disparity, _ = cotton.errors_of(field, truth)
-        # Windows across occlusions whose disparity would leave the window have no value.
-        assert np.isfinite(disparity).mean() > 0.98
+        assert np.isfinite(disparity).mean() > 0.99
         medians.append(np.median(np.abs(disparity[np.isfinite(disparity)])))
     # The goal; and less residual disparity must mean less error of the filters.
     assert medians[0] < 0.01

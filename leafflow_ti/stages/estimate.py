@@ -182,8 +182,8 @@ class EstimateStage:
         value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
         value[Value.RANGE_CAUTION] = RANGE_CAUTION
-        # Content that leaves the window from one frame to the next cannot be followed.
-        value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size) // 2
+        # Windows that do not overlap from one frame to the next share no content that could be followed.
+        value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size)
         value[Value.DENOISE] = DENOISE[problem.estimator]
         lower = np.tril_indices(columns.n_flow)
         ratios = [noise_ratio(sampling, columns, a)[lower] for a in columns.solutions]
