@@ -21,9 +21,12 @@ from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
 
 Preset = Literal["fast", "balanced", "accurate"]
-ModelName = Literal["auto", "flow", "flow-affine", "depth", "affine-translation", "affine", "affine-4d", "affine-5d"]
+ModelName = Literal[
+    "auto", "flow", "flow-affine", "flow-quadratic", "depth", "affine-translation", "affine", "affine-4d", "affine-5d"
+]
 Motion = Literal["translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
+BrightnessTerms = Literal["none", "time", "space", "both"]
 Estimator = Literal["ols", "tls", "tls-equilibrated"]
 Solver = Literal["fast", "jacobi"]
 Border = Literal["full", "clip"]
@@ -125,6 +128,7 @@ class ModelSection(_Section):
     motion: Motion = "rotation"
     rows: str = "auto"
     brightness: Brightness = "none"
+    brightness_terms: BrightnessTerms = "none"
     estimator: Estimator = "tls-equilibrated"
     solver: Solver = "fast"
     weighting: Weighting = "wls"

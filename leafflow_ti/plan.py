@@ -16,7 +16,7 @@ from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import choose_filter_set, filter_set
 from leafflow_ti.models import MODELS, TensorLayout, column_set, parse_rows
 from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.estimate import Problem, unknowns_of
+from leafflow_ti.stages.estimate import BRIGHTNESS_MAPS, WORLD_MAPS, Problem, unknowns_of
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -89,7 +89,9 @@ class Plan:
         if "t" in problem.columns.solutions:
             names += ["flow_x", "flow_y"]
         if problem.columns.index("i") is not None:
-            names += [f"brightness_{a}" for a in problem.columns.solutions]
+            names += [f"brightness_{a}" for a in problem.camera_axes]
+        names += [BRIGHTNESS_MAPS[o] for o in problem.brightness]
+        names += [WORLD_MAPS[o] for o in problem.world_brightness]
         return tuple(names)
 
     def band(self, index: int) -> slice:
@@ -163,7 +165,9 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         _series(capture.n_rows, row, *camera) if use_y else AxisSampling(),
         _series(capture.n_frames, capture.n_frames // 2, *time, sequence=True) if model.time else AxisSampling(),
     )
-    columns = column_set(model, config.model.brightness, sampling.camera_axes, sampling.sampled)
+    columns = column_set(
+        model, config.model.brightness, sampling.camera_axes, sampling.sampled, config.model.brightness_terms
+    )
     grid = bool(sampling.camera_axes)
     unknowns = unknowns_of(config.model.motion, columns) if grid and model.time else 0
     offsets: tuple[str, ...] = ("1",)

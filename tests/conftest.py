@@ -114,12 +114,7 @@ class Estimated:
         """Values and standard errors [rows, cols] of a named map."""
         from leafflow_ti.kernels.maps import Output
 
-        if name in MOTION_NAMES:
-            plane = Output.MOTION + MOTION_NAMES.index(name)
-        elif name.startswith("brightness_"):
-            plane = Output.BRIGHTNESS + self.problem.columns.solutions.index(name.removeprefix("brightness_"))
-        else:
-            plane = Output[name.upper()]
+        plane = Output.MOTION + MOTION_NAMES.index(name) if name in MOTION_NAMES else Output[name.upper()]
         return self.planes[plane], self.planes[Output.STD + plane]
 
     @property
@@ -252,7 +247,10 @@ def bench(device: Callable[[str], Device]) -> MakeBench:
     """``bench(model, brightness, grid, precision)``: the scene as that model sees it."""
 
     @functools.cache
-    def make(model: str, brightness: str, grid: str, precision: str, stride: int = STRIDE, cols: int = COLS) -> Bench:
+    def make(
+        model: str, brightness: str, grid: str, precision: str,
+        stride: int = STRIDE, cols: int = COLS, terms: str = "none",
+    ) -> Bench:  # fmt: skip
         sampling = sampling_of(grid, MODELS[model].time, cameras=MODELS[model].cameras)
         band = Band.of(sampling, ROWS, cols, stride)
         scene = replace(SCENE, brightness=LIGHT if brightness != "none" else ())
@@ -261,7 +259,7 @@ def bench(device: Callable[[str], Device]) -> MakeBench:
             images = images[:, GRIDS[grid][0] // 2][:, None]
         if not MODELS[model].time:
             images = images[SCENE.n_frames // 2][None]
-        columns = column_set(MODELS[model], brightness, sampling.camera_axes, sampling.sampled)
+        columns = column_set(MODELS[model], brightness, sampling.camera_axes, sampling.sampled, terms)
         return Bench(device(precision), images, sampling, columns, band, model)
 
     return make

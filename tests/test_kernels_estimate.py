@@ -46,6 +46,7 @@ def test_parameters_equal_the_twin(bench: Callable, case: tuple[str, str, str], 
         J, rho = b.reference(*pixel)
         P, variance = chain.solve(J, b.columns, b.sampling, estimator)
         cov = chain.covariances(J, variance, b.columns, b.sampling, rho, DENOISE[estimator])
+        P, cov = chain.at_centre(P, cov, b.columns)
         std = np.sqrt([np.diag(cov[k, k]) for k in range(b.columns.n_time_like)])
         for result in found.values():
             assert result.status[pixel] == Status.OK

@@ -68,6 +68,20 @@ class Problem:
         return tuple(o for o in ("1", "x", "y", "t") if self.columns.index("x", o) is not None)
 
     @property
+    def brightness(self) -> tuple[str, ...]:
+        """Offsets of the brightness change in time that are measured."""
+        if "t" not in self.columns.solutions:
+            return ()
+        return tuple(o for o in ("1", "x", "y", "t") if self.columns.index("i", o) is not None)
+
+    @property
+    def world_brightness(self) -> tuple[str, ...]:
+        """Of these, the ones that geometry (for the slopes) and motion (for the trend) carry into the world (4.28)."""
+        if not {"x", "y"} <= {*self.brightness} & {*self.terms}:
+            return ()
+        return tuple(o for o in self.brightness if o in ("x", "y") or (o == "t" and self.unknowns))
+
+    @property
     def camera_axes(self) -> tuple[str, ...]:
         """Camera axes with a solution."""
         return tuple(a for a in self.columns.solutions if a != "t")
@@ -82,6 +96,17 @@ def unknowns_of(motion: str, columns: ColumnSet) -> int:
     if columns.index("x", "x") is None:
         return 2
     return {"translation": 3, "rotation": 6, "acceleration": 8}[motion]
+
+
+BRIGHTNESS_MAPS = {"1": "brightness_t", "x": "brightness_tx", "y": "brightness_ty", "t": "brightness_tt"}
+WORLD_MAPS = {"x": "brightness_world_x", "y": "brightness_world_y", "t": "brightness_world_tt"}
+"""Offset of the brightness change in time -> name of its map, in the image and on the material."""
+
+
+def _packed(a: int, b: int) -> int:
+    """Position of an element of a symmetric matrix in its packed lower triangle."""
+    r, c = max(a, b), min(a, b)
+    return r * (r + 1) // 2 + c
 
 
 @dataclass(frozen=True)
@@ -114,9 +139,11 @@ class EstimateStage:
             len(problem.terms), 2 * len(problem.offsets) + problem.use_range,
         )  # fmt: skip
         flow = columns.n_flow
-        self.numbers = np.full(Number.LOWER + len(layout.lower), -1, np.int32)
+        self._noise = [noise_ratio(problem.sampling, columns, a) for a in columns.solutions]
+        terms = len(self._noise[0][1])
+        self.numbers = np.full(Number.LOWER + len(layout.lower) + 2 * terms, -1, np.int32)
         self.numbers[: len(Region)] = self.layout.offsets
-        self.values = np.zeros(Value.RATIO + columns.n_time_like * flow * (flow + 1) // 2)
+        self.values = np.zeros(Value.RATIO + columns.n_time_like * (flow * (flow + 1) // 2 + terms))
         self._fill_model(rows, layout)
         self.set_view(view)
         lanes = device.dense.lanes
@@ -131,21 +158,21 @@ class EstimateStage:
         self._maps = device.empty(Output.PLANES * n_pixels)
 
     def _rows(self) -> SimpleNamespace:
-        """Columns of the motion rows and of each camera solution's geometry rows; a brightness row stands last."""
+        """Columns of the motion rows and of each camera solution's geometry rows; brightness rows stand last."""
         problem, columns = self.problem, self.problem.columns
-        last = [i for i in [columns.index("i")] if i is not None]
 
-        def both(own: str, offsets: Sequence[str]) -> list[int]:
+        def both(own: str, offsets: Sequence[str], brightness: Sequence[str]) -> list[int]:
             other = "y" if own == "x" else "x"
             found = [columns.index(c, o) for c in (own, other) for o in offsets]
-            return [i for i in found if i is not None] + last
+            found += [columns.index("i", o) for o in brightness]
+            return [i for i in found if i is not None]
 
-        motion = both("x", problem.offsets) if "t" in columns.solutions else []
-        return SimpleNamespace(
-            motion=motion, camera=[both("x" if a == "sx" else "y", problem.terms) for a in problem.camera_axes]
-        )
+        motion = both("x", problem.offsets, problem.brightness) if "t" in columns.solutions else []
+        camera = [both("x" if a == "sx" else "y", problem.terms, ["1"]) for a in problem.camera_axes]
+        return SimpleNamespace(motion=motion, camera=camera)
 
     def _fill_model(self, rows: SimpleNamespace, layout: TensorLayout) -> None:
+        from leafflow_ti.kernels.maps import Output
         from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Value
 
         problem, columns, sampling = self.problem, self.problem.columns, self.problem.sampling
@@ -165,14 +192,23 @@ class EstimateStage:
         number[Number.PASSES] = problem.passes
         brightness = columns.index("i")
         number[Number.BRIGHTNESS_COLUMN] = -1 if brightness is None else brightness
+        number[Number.BRIGHTNESS_ROWS] = len(problem.brightness)
+        planes = [Output[BRIGHTNESS_MAPS[o].upper()] - Output.BRIGHTNESS_T for o in problem.brightness]
+        number[Number.BRIGHTNESS_PLANES : Number.BRIGHTNESS_PLANES + len(planes)] = planes
+        number[Number.WORLD_ROW] = 2 * len(problem.offsets) + 1
+        number[Number.WORLD_MAPS] = len(problem.world_brightness)
+        number[Number.CENTRE_TERMS] = len(columns.at_centre)
+        for j, (constant, square, factor) in enumerate(columns.at_centre):
+            number[Number.CENTRE + 2 * j : Number.CENTRE + 2 * j + 2] = constant, square
+            value[Value.CENTRE + j] = factor
         number[Number.RANGE_TERM] = problem.terms.index("t") if "t" in problem.terms else -1
         number[Number.CAMERA_SOLUTIONS] = len(problem.camera_axes)
         number[Number.EXTRA] = len(layout.entries)
-        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = [columns.columns.index(Column(c)) for c in ("x", "y")]
+        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = [columns.columns.index(Column.of(c)) for c in ("x", "y")]
         for i, o in enumerate(problem.offsets):
             number[Number.OFFSET_CODES + i] = 0 if o == "1" else 1 + AXES.index(o)
         number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows.motion)] = rows.motion
-        number[Number.LOWER :] = layout.lower
+        number[Number.LOWER : Number.LOWER + len(layout.lower)] = layout.lower
         noise = column_noise(sampling, columns)
         value[Value.RIDGE], value[Value.GAP], value[Value.STEP_SIZE] = (t[precision] for t in (RIDGE, GAP, STEP_SIZE))
         value[Value.SCALE : Value.SCALE + columns.n] = noise**-0.5
@@ -185,9 +221,7 @@ class EstimateStage:
         # Windows that do not overlap from one frame to the next share no content that could be followed.
         value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size)
         value[Value.DENOISE] = DENOISE[problem.estimator]
-        lower = np.tril_indices(columns.n_flow)
-        ratios = [noise_ratio(sampling, columns, a)[lower] for a in columns.solutions]
-        value[Value.RATIO :] = np.concatenate(ratios)
+        self._fill_noise(layout, noise**-0.5)
         number[Number.CROSS_TERMS] = 0
         for k, axis in enumerate(problem.camera_axes):
             number[Number.CAMERA_AXIS + k] = 0 if axis == "sx" else 1
@@ -196,10 +230,23 @@ class EstimateStage:
             terms = cross_noise(sampling, columns, axis, "t") if has_time else ()
             number[Number.CROSS_TERMS] = len(terms)
             for j, term in enumerate(terms):
-                r, c = max(term.base_a, term.base_b), min(term.base_a, term.base_b)
                 at = Number.CROSS_AB + (k * 9 + j) * 3
-                number[at : at + 3] = term.a, term.b, layout.lower[r * (r + 1) // 2 + c]
+                number[at : at + 3] = term.a, term.b, layout.lower[_packed(term.base_a, term.base_b)]
                 value[Value.CROSS + k * 9 + j] = term.value
+
+    def _fill_noise(self, layout: TensorLayout, scale: NDArray[np.float64]) -> None:
+        """Tables of each solution's noise: ratios, then the terms that centred squares add to them."""
+        from leafflow_ti.kernels.workspace import Number, Value
+
+        lower = np.tril_indices(self.problem.columns.n_flow)
+        ratios = [ratio[lower] for ratio, _ in self._noise]
+        terms = [[t.value * scale[t.a] * scale[t.b] for t in extra] for _, extra in self._noise]
+        self.values[Value.RATIO :] = np.concatenate([*ratios, *terms])
+        self.numbers[Number.NOISE_TERMS] = len(terms[0])
+        at = Number.LOWER + len(layout.lower)
+        self.numbers[at:] = [
+            n for t in self._noise[0][1] for n in (_packed(t.a, t.b), layout.lower[_packed(t.base_a, t.base_b)])
+        ]
 
     def set_view(self, view: View) -> None:
         """Move to another band of the same size."""

@@ -3,6 +3,8 @@
 Only the tables (columns, filters, noise factors) come from the library.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import correlate1d, minimum_filter
 
@@ -49,14 +51,35 @@ def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels, val
         window = tuple(slice(where[a] - half[a], where[a] + half[a] + 1) for a in ARRAY_AXIS)
         d = []
         for column in columns.columns:
-            value = channels[column.channel][window].copy()
-            for a, e in zip(AXES, column.exponents, strict=True):
-                value *= grids[a] ** e
-            d.append(value.ravel())
-        d = np.array(d)
-        counted = weight * seen[window[0], None, None, window[3], window[4]]
-        result.append((d * counted.ravel()) @ d.T)
+            d.append({})
+            for term in column.terms:
+                value = term.factor * channels[term.channel][window]
+                for a, e in zip(AXES, term.exponents, strict=True):
+                    value *= grids[a] ** e
+                d[-1][term.vector] = d[-1].get(term.vector, 0.0) + value.ravel()
+        counted = (weight * seen[window[0], None, None, window[3], window[4]]).ravel()
+        J = np.zeros((columns.n, columns.n))
+        for vector in {v for values in d for v in values}:
+            one = np.array([values.get(vector, np.zeros(counted.size)) for values in d])
+            J += (one * counted) @ one.T
+        result.append(J)
     return np.array(result)
+
+
+def shares(columns: ColumnSet):
+    """Matrix [n_flow, n_flow] by which the columns come from monomials: 1, and what centring takes off."""
+    flow = columns.columns[: columns.n_flow]
+    T = np.eye(columns.n_flow)
+    for i, column in enumerate(flow):
+        for term in column.terms[1:]:
+            T[i, [c.terms[0] for c in flow].index(replace(term, factor=1.0))] = term.factor
+    return T
+
+
+def at_centre(P, cov, columns: ColumnSet):
+    """Parameters [n_flow, k] and covariances of monomials instead of centred columns: the values at the centre."""
+    T = shares(columns)
+    return T.T @ P, T.T @ cov @ T
 
 
 def texture_smoothness(images, sampling: Sampling, x, y):
@@ -109,7 +132,10 @@ def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, d
         for j, two in enumerate(columns.solutions):
             M = np.zeros((n, n))
             if i == j:
-                M = J[:n, :n] * noise_ratio(sampling, columns, one)
+                # The ratios are those of monomials: there, and back.
+                T = shares(columns)
+                R = np.linalg.inv(T)
+                M = T @ (R @ J[:n, :n] @ R.T * noise_ratio(sampling, columns, one)[0]) @ T.T
             else:
                 for term in cross_noise(sampling, columns, one, two):
                     M[term.a, term.b] = J[term.base_a, term.base_b] * term.value
@@ -289,12 +315,14 @@ def measure(J, rho, problem, view, x, y):
     columns, sampling = problem.columns, problem.sampling
     P, variance = solve(J, columns, sampling, problem.estimator)
     cov = covariances(J, variance, columns, sampling, rho, estimate.DENOISE[problem.estimator])
+    P, cov = at_centre(P, cov, columns)
     x0, y0, f = x - view.principal_px[0], y - view.principal_px[1], view.f_px
     found = {}
     for k, axis in enumerate(columns.solutions):
-        i = columns.index("i")
-        if i is not None:
-            found[f"brightness_{axis}"] = (-P[i, k], np.sqrt(cov[k, k, i, i]))
+        for o in ("1", "x", "y", "t") if axis == "t" else ("1",):
+            i = columns.index("i", o)
+            if i is not None:
+                found[f"brightness_{axis}{o.strip('1')}"] = (-P[i, k], np.sqrt(cov[k, k, i, i]))
         if axis == "t":
             for a in ("x", "y"):
                 i = columns.index(a)
@@ -328,4 +356,17 @@ def measure(J, rho, problem, view, x, y):
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
         for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=True):
             found[name] = (value, error)
+    if problem.world_brightness:
+        i = [columns.index("i", o) for o in problem.world_brightness]
+        Z0, ZX, ZY, c = surface(x0, y0, f, *g)
+        dX = Z0 / (f * c) * np.array([[1 - ZY * y0 / f, ZX * y0 / f], [ZY * x0 / f, 1 - ZX * x0 / f]])
+        A = np.zeros((len(i), len(i)))
+        A[:2, :2] = np.linalg.inv(dX)
+        if len(i) == 3:
+            Zt = q[2] - ZX * q[0] - ZY * q[1]
+            drift = Zt / (f * c) * np.array([x0, y0]) - q[:2]
+            A[2] = [*(-drift @ A[:2, :2]), 1.0]
+        values, spread = A @ -P[i, -1], A @ cov[-1, -1][np.ix_(i, i)] @ A.T
+        for name, value, variance in zip(("x", "y", "tt"), values, np.diag(spread), strict=False):
+            found[f"brightness_world_{name}"] = (value, np.sqrt(variance))
     return found
