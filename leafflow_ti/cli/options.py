@@ -20,15 +20,18 @@ Model = Annotated[
     str | None,
     _text(
         "model",
-        "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d",
-        "What is estimated [auto: affine-4d for a line of cameras, affine-5d for a 2D grid, depth without time, "
-        "flow-affine for one camera].",
+        "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d|scene-flow|"
+        "affine-scene-flow",
+        "What is estimated [auto: affine-scene-flow for a camera grid, depth without time, flow-affine for one camera].",
     ),
 ]
 Motion = Annotated[
-    str | None, _text("motion", "translation|rotation|acceleration", "Unknowns of the 3D motion [rotation].")
+    str | None,
+    _text("motion", "auto|translation|rotation|acceleration", "Unknowns of the 3D motion [auto: rotation, if it can]."),
 ]
-Rows = Annotated[str | None, _text("rows", "auto|2d[+b5][+as][+at]", "Flow parameters that enter the 3D fit [auto].")]
+Rows = Annotated[
+    str | None, _text("rows", "auto|(u|2d)[+b5][+as][+at]", "Flow parameters that enter the 3D fit [auto].")
+]
 Brightness = Annotated[
     str | None, _text("brightness", "none|temporal|spatial|camera", "Brightness changes that are modelled [none].")
 ]
