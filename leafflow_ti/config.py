@@ -26,6 +26,7 @@ Motion = Literal["translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
 Estimator = Literal["ols", "tls", "tls-equilibrated"]
 Solver = Literal["fast", "jacobi"]
+PrefilterName = Literal["none", "highpass", "homomorphic"]
 Border = Literal["full", "clip"]
 Weighting = Literal["wls", "ls"]
 Precision = Literal["f32", "f64"]
@@ -167,11 +168,16 @@ class WindowSection(_Section):
 
 
 class FiltersSection(_Section):
-    """Derivative filters per axis; "auto" takes the largest set up to ``taps`` that the number of samples allows."""
+    """Derivative filters per axis; "auto" takes the largest set up to ``taps`` that the number of samples allows.
+
+    ``prefilter`` of every image, with a Gaussian of ``sigma_pre`` pixels.
+    """
 
     taps: _Taps = "5"
     taps_time: _AutoTaps = "auto"
     taps_camera: _AutoTaps = "auto"
+    prefilter: PrefilterName = "none"
+    sigma_pre: _Width = 8.0
 
 
 class PlanSection(_Section):

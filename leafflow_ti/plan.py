@@ -13,10 +13,11 @@ import numpy as np
 from leafflow_ti.capture import Capture, Geometry, find_preshift
 from leafflow_ti.config import RunConfig, resolve_model
 from leafflow_ti.errors import ConfigError, InputError
-from leafflow_ti.filters import choose_filter_set, filter_set
+from leafflow_ti.filters import choose_filter_set, filter_set, gaussian_radius
 from leafflow_ti.models import MODELS, TensorLayout, column_set, parse_rows
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import Problem, unknowns_of
+from leafflow_ti.stages.prefilter import prefilter_bytes
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -86,11 +87,24 @@ class Plan:
         if "x" in problem.terms:
             names += ["slope_x", "slope_y"]
         names += MOTION_NAMES[: problem.unknowns]
+        if "depth" in names and problem.unknowns >= 3:
+            names.append("growth_rate")
         if "t" in problem.columns.solutions:
             names += ["flow_x", "flow_y"]
         if problem.columns.index("i") is not None:
             names += [f"brightness_{a}" for a in problem.columns.solutions]
         return tuple(names)
+
+    @property
+    def margin(self) -> int:
+        """Output pixels around a band, and around the region, that are computed for the sake of those inside."""
+        return int(any(name.startswith("growth") for name in self.names))
+
+    @property
+    def prefilter_radius(self) -> int:
+        """Pixels that a prefilter needs around the images' blocks."""
+        filters = self.config.filters
+        return 0 if filters.prefilter == "none" else gaussian_radius(filters.sigma_pre)
 
     def band(self, index: int) -> slice:
         """Output rows of one band."""
@@ -127,6 +141,9 @@ class Plan:
             lines.append(f"motion      {problem.unknowns} unknowns from {n_rows} rows ({rows})")
         pixels = len(self.frames) * len(self.y) * len(self.x)
         limit = self.config.plan.max_memory
+        filters = self.config.filters
+        if filters.prefilter != "none":
+            lines.append(f"prefilter   {filters.prefilter}, sigma {filters.sigma_pre:g} px")
         lines += [
             f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
             f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
@@ -149,6 +166,11 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     name = resolve_model(config.model.name, capture.n_frames, capture.n_rows, capture.n_cols)
     model = MODELS[name]
     _check_model(name, capture)
+    if config.filters.prefilter == "highpass" and config.model.brightness != "none":
+        raise ConfigError(
+            f"brightness '{config.model.brightness}' relates changes to the grey value, which prefilter 'highpass' takes "
+            "away: choose prefilter homomorphic, or brightness none"
+        )
     row, col = capture.reference
     use_x = capture.n_cols > 1 and model.cameras != "reference"
     use_y = capture.n_rows > 1 and (model.cameras == "grid" or (model.cameras == "line" and not use_x))
@@ -263,8 +285,14 @@ def _band_rows(config: RunConfig, problem: Problem, layout: TensorLayout, rows: 
     itemsize = 4 if config.precision == "f32" else 8
 
     def size(n: int) -> int:
-        band = Band.of(problem.sampling, n, cols, config.window.stride)
-        return band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
+        # Two more rows and columns for the growth at the edges.
+        band = Band.of(problem.sampling, n + 2, cols + 2, config.window.stride)
+        total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
+        if config.filters.prefilter != "none":
+            sampling, sigma = problem.sampling, config.filters.sigma_pre
+            cameras = (2 * sampling.sy.radius + 1) * (2 * sampling.sx.radius + 1)
+            total += prefilter_bytes(sigma, cameras, band.in_rows, band.in_cols, itemsize)
+        return total
 
     limit = int(0.8 * config.plan.max_memory)
     if config.plan.tile != "auto":

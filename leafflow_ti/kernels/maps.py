@@ -23,8 +23,9 @@ class Output(IntEnum):
     FLOW_Y = 14
     BRIGHTNESS = 15  # 3, in the order of the solutions
     STD = 18
-    STATUS = 36
-    PLANES = 37
+    COVARIANCE = 36  # 3: between the components of the velocity, xy, xz, yz
+    STATUS = 39
+    PLANES = 40
 
 
 @functools.cache
@@ -135,6 +136,11 @@ def maps_kernel(spec: KernelSpec):
                 q = base + (number[Region.MOTION] + j) * stride + i
                 cov = base + (number[Region.MOTION_COV] + j * n + j) * stride + i
                 put(out, Output.MOTION + j, at, n_pixels, ws[q], ws[cov])
+            if n >= 3:
+                for r in range(1, 3):
+                    for c in range(r):
+                        cov = base + (number[Region.MOTION_COV] + c * n + r) * stride + i
+                        out[(Output.COVARIANCE + tri(r - 1, c)) * n_pixels + at] = ti.cast(ws[cov], real)
             rows = base + number[Region.COV_T] * stride + i
             if solution >= 0:
                 for k in range(2):
