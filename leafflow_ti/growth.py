@@ -11,10 +11,9 @@ centred one is exactly zero for every rigid motion.
 Derivatives are central differences over the neighbouring output pixels, one-sided where one of the two has no value.
 Where both are missing along x or along y there is no growth rate: NaN, and NaN its standard error.
 
-Standard errors: neighbouring windows share most of their noise. The error at distance d has the correlation of the
-window's weights, ``R(d) = Σ w(x) w(x + d) / Σ w²`` along each axis, so a difference over the span D has the variance
-``2 (1 - R(D))/D²`` times that of the velocity. Differences along x and y are uncorrelated unless both are one-sided.
-The noise of the positions is left out: it enters times the rotation and growth per frame only.
+Standard errors follow from the covariances of the velocity's central differences (see ``sampling.difference_variance``
+and ``kernels.patch_fit``). Differences along x and y are uncorrelated unless both are one-sided. The noise of the
+positions is left out: it enters times the rotation and growth per frame only.
 """
 
 from __future__ import annotations
@@ -25,20 +24,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.sampling import AxisSampling, Sampling
+from leafflow_ti.sampling import AxisSampling, Sampling, difference_variance
 
 Array = NDArray[np.float64]
 
 VELOCITY = ("velocity_x", "velocity_y", "velocity_z")
-COVARIANCES = ("velocity_xy", "velocity_xz", "velocity_yz")
-"""Covariances between the components of the velocity [mm²/frame²]: needed here, no maps of the results."""
-INPUTS = ("depth", *VELOCITY, *(f"{name}_std" for name in VELOCITY), *COVARIANCES)
-
-
-def correlation(axis: AxisSampling, distance: int) -> float:
-    """R: correlation of the errors of two windows ``distance`` samples apart along one axis."""
-    w = np.array(axis.weights)
-    return float(np.dot(w[distance:], w[: max(w.size - distance, 0)]) / np.dot(w, w))
+DIFFERENCES = tuple(f"difference_{axis}_{pair}" for axis in "xy" for pair in ("xx", "xy", "yy", "xz", "yz", "zz"))
+"""Covariances of the central differences of the velocity along x and y [mm²/(frame px)²], packed: no maps of results."""
+INPUTS = ("depth", *VELOCITY, *DIFFERENCES)
 
 
 @dataclass(frozen=True)
@@ -77,9 +70,9 @@ class Differences:
             return np.asarray((high - low) / (self.span * self.step))
 
     def variance(self, window: AxisSampling) -> Array:
-        """Variance of the quotients per variance of the values, [h, w]."""
-        table = [np.nan] + [2 * (1 - correlation(window, n * self.step)) / (n * self.step) ** 2 for n in (1, 2)]
-        return np.array(table)[self.span]
+        """Variance of the quotients per variance of a central one, [h, w]."""
+        one, two = (difference_variance(window, n * self.step) for n in (1, 2))
+        return np.array([np.nan, one / two, 1.0])[self.span]
 
 
 def growth_maps(
@@ -96,7 +89,7 @@ def growth_maps(
     the windows along y and x.
     """
     depth, *given = (np.asarray(maps[name], np.float64) for name in INPUTS)
-    velocity, covariance = given[:3], _covariance(given[3:6], given[6:])
+    velocity, packed = given[:3], (given[3:9], given[9:])
     known = np.isfinite(depth) & np.isfinite(velocity).all(axis=0)
     ray = ((np.array(x) - principal_px[0]) / f_px, ((np.array(y) - principal_px[1]) / f_px)[:, None], 1.0)
     across, down = Differences.over(known, 1, x.step), Differences.over(known, 0, y.step)
@@ -105,16 +98,9 @@ def growth_maps(
     ends = [_element(a, b, p, q, half) for half in (0.5, -0.5)]
     ratio = ends[0].area / ends[1].area
     gradient = [[0.5 * (one + two) for one, two in zip(*sides, strict=True)] for sides in zip(*(e.by for e in ends))]
-    kx, ky = across.variance(sampling.x), down.variance(sampling.y)
-    cross = across.side * down.side * 1.0
-    for axis, d in ((sampling.x, across), (sampling.y, down)):
-        cross = cross * ((1 - correlation(axis, d.step)) / d.step)
-    variance = np.zeros_like(ratio)
-    for i in range(3):
-        for j in range(3):
-            g, h = gradient
-            both = g[i] * g[j] * kx + h[i] * h[j] * ky + (g[i] * h[j] + h[i] * g[j]) * cross
-            variance = variance + both * covariance[i][j]
+    variance = _both_one_sided(across, down, sampling, packed, gradient)
+    for d, window, cov, g in zip((across, down), (sampling.x, sampling.y), packed, gradient, strict=True):
+        variance = variance + d.variance(window) * _form(cov, g, g)
     return {"growth_rate": 100 * (ratio - 1), "growth_rate_std": 100 * ratio * np.sqrt(np.maximum(variance, 0))}
 
 
@@ -141,10 +127,28 @@ def _cross(u: list[Array], v: list[Array]) -> list[Array]:
     return [u[(i + 1) % 3] * v[(i + 2) % 3] - u[(i + 2) % 3] * v[(i + 1) % 3] for i in range(3)]
 
 
-def _covariance(std: list[Array], off: list[Array]) -> list[list[Array]]:
-    xy, xz, yz = off
-    x, y, z = (s * s for s in std)
-    return [[x, xy, xz], [xy, y, yz], [xz, yz, z]]
+def _form(packed: list[Array], u: list[Array], v: list[Array]) -> Array:
+    """``u^T C v`` for the packed symmetric C."""
+    total = np.zeros_like(packed[0])
+    for i in range(3):
+        for j in range(3):
+            total = total + u[i] * packed[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] * v[j]
+    return total
+
+
+def _both_one_sided(
+    across: Differences, down: Differences, sampling: Sampling, packed: tuple[list[Array], ...], gradient: list[list[Array]]
+) -> Array:
+    """What the covariance between differences along x and y adds to the variance, [h, w].
+
+    One-sided ones share the pixel itself: ``± (1 - R(dx)) (1 - R(dy)) / (dx dy)`` times the covariance of the velocity.
+    """
+    side, factor, total = across.side * down.side, 1.0, [np.zeros(u.shape) for u in packed[0]]
+    for d, window, cov in zip((across, down), (sampling.x, sampling.y), packed, strict=True):
+        factor *= 0.5 * difference_variance(window, d.step) * d.step
+        central = difference_variance(window, 2 * d.step)
+        total = [t + 0.5 * u / central for t, u in zip(total, cov, strict=True)]
+    return side * factor * 2 * _form(total, *gradient)
 
 
 def _moved(values: NDArray, axis: int, by: int, empty: object) -> NDArray:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import read_gray
 from leafflow_ti.errors import ConfigError, InputError
-from leafflow_ti.growth import COVARIANCES, INPUTS, growth_maps
+from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import EstimateStage, View
@@ -287,8 +287,8 @@ def _plane_of(name: str, solutions: tuple[str, ...]) -> int:
 
     if name in MOTION_NAMES:
         return Output.MOTION + MOTION_NAMES.index(name)
-    if name in COVARIANCES:
-        return Output.COVARIANCE + COVARIANCES.index(name)
+    if name in DIFFERENCES:
+        return Output.DIFFERENCES + DIFFERENCES.index(name)
     if name.startswith("brightness_"):
         return Output.BRIGHTNESS + solutions.index(name.removeprefix("brightness_"))
     return int(Output[name.upper()])

@@ -23,9 +23,9 @@ class Output(IntEnum):
     FLOW_Y = 14
     BRIGHTNESS = 15  # 3, in the order of the solutions
     STD = 18
-    COVARIANCE = 36  # 3: between the components of the velocity, xy, xz, yz
-    STATUS = 39
-    PLANES = 40
+    DIFFERENCES = 36  # 2 x packed [3]: covariance of the velocity's difference quotients along x and y
+    STATUS = 48
+    PLANES = 49
 
 
 @functools.cache
@@ -137,10 +137,12 @@ def maps_kernel(spec: KernelSpec):
                 cov = base + (number[Region.MOTION_COV] + j * n + j) * stride + i
                 put(out, Output.MOTION + j, at, n_pixels, ws[q], ws[cov])
             if n >= 3:
-                for r in range(1, 3):
-                    for c in range(r):
-                        cov = base + (number[Region.MOTION_COV] + c * n + r) * stride + i
-                        out[(Output.COVARIANCE + tri(r - 1, c)) * n_pixels + at] = ti.cast(ws[cov], real)
+                for axis in range(2):
+                    for r in range(3):
+                        for c in range(r + 1):
+                            cov = base + (number[Region.DIFFERENCE_COV] + (axis * n + r) * n + c) * stride + i
+                            plane = Output.DIFFERENCES + 6 * axis + tri(r, c)
+                            out[plane * n_pixels + at] = ti.cast(ws[cov], real)
             rows = base + number[Region.COV_T] * stride + i
             if solution >= 0:
                 for k in range(2):

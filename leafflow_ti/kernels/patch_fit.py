@@ -250,6 +250,31 @@ def patch_fit_kernel(spec: KernelSpec):
         small.solve(ws, normal, q, n, 1, stride)
 
     @ti.func
+    def propagate(
+        base: ti.i32, cov: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()
+    ):
+        """Covariance [n, n] at ``cov`` of the solution for the covariance of the rows in SPREAD."""
+        n = number[Number.UNKNOWNS]
+        weighted = base + number[Region.WEIGHTED] * stride
+        spread = base + number[Region.SPREAD] * stride
+        work = base + number[Region.MOTION_WORK] * stride
+        small.symmetric_times(ws, spread, weighted, work, n_rows, n, stride)
+        for r in range(n):
+            for c in range(n):
+                element = small.dot(ws, weighted + r * stride, n, work + c * stride, n, n_rows, stride)
+                small.store(ws, cov + (r * n + c) * stride, element)
+        small.sandwich(ws, base + number[Region.NORMAL] * stride, cov, n, 2, stride)
+
+    @ti.func
+    def difference(axis: ti.i32, r: ti.i32, number: ti.template(), value: ti.template()) -> precise:
+        """Error of a row's difference quotient along an axis per error of the row."""
+        offsets = number[Number.OFFSETS]
+        code = 0  # the range constraint is a mean over the window
+        if r < 2 * offsets:
+            code = number[Number.OFFSET_CODES + r % offsets]
+        return value[Value.DIFFERENCE + 6 * axis + code]
+
+    @ti.func
     def patch_fit(
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
@@ -265,16 +290,20 @@ def patch_fit_kernel(spec: KernelSpec):
             design(base, pixel, stride, n_rows, number, value, ws)
             row_spread(base, stride, n_rows, number, value, ws)
             solve(base, stride, n_rows, number, ws)
-        weighted = base + number[Region.WEIGHTED] * stride
         total = base + number[Region.TOTAL] * stride
-        work = base + number[Region.MOTION_WORK] * stride
-        normal = base + number[Region.NORMAL] * stride
+        spread = base + number[Region.SPREAD] * stride
         cov = base + number[Region.MOTION_COV] * stride
-        small.symmetric_times(ws, total, weighted, work, n_rows, n, stride)
-        for r in range(n):
-            for c in range(n):
-                element = small.dot(ws, weighted + r * stride, n, work + c * stride, n, n_rows, stride)
-                small.store(ws, cov + (r * n + c) * stride, element)
-        small.sandwich(ws, normal, cov, n, 2, stride)
+        small.copy(ws, total, spread, n_rows * (n_rows + 1) // 2, stride)
+        propagate(base, cov, stride, n_rows, number, ws)
+        # Windows side by side share their noise: what is left of it in a difference depends on the rows' offsets.
+        for axis in range(2):
+            for r in range(n_rows):
+                for c in range(r + 1):
+                    factor = difference(axis, r, number, value) * difference(axis, c, number, value)
+                    at = tri(r, c) * stride
+                    for i in range(lanes):
+                        ws[spread + at + i] = factor * ws[total + at + i]
+            target = base + (number[Region.DIFFERENCE_COV] + axis * n * n) * stride
+            propagate(base, target, stride, n_rows, number, ws)
 
     return batch_kernel(spec, patch_fit)

@@ -55,6 +55,7 @@ class Region(IntEnum):
     GEOMETRY_WORK = auto()  # [S, G]
     MOTION = auto()  # [9]
     MOTION_COV = auto()  # [9, 9]
+    DIFFERENCE_COV = auto()  # [2, 9, 9]: of difference quotients of the motion along x and y
     DESIGN = auto()  # [M, 9]
     VALUE = auto()  # [M]
     WEIGHTED = auto()  # [M, 10]
@@ -118,6 +119,7 @@ class Layout:
             Region.GEOMETRY_WORK: s * terms,
             Region.MOTION: MAX_UNKNOWNS,
             Region.MOTION_COV: MAX_UNKNOWNS * MAX_UNKNOWNS,
+            Region.DIFFERENCE_COV: 2 * MAX_UNKNOWNS * MAX_UNKNOWNS,
             Region.DESIGN: motion * MAX_UNKNOWNS,
             Region.VALUE: motion,
             Region.WEIGHTED: motion * (MAX_UNKNOWNS + 1),
@@ -197,7 +199,8 @@ class Value(IntEnum):
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9
-    RATIO = CROSS + 18  # k x packed [F]
+    DIFFERENCE = CROSS + 18  # 2 x 6: by axis and offset of a motion row, see sampling.difference_factor; square roots
+    RATIO = DIFFERENCE + 12  # k x packed [F]
 
 
 @functools.cache

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from leafflow_ti.models import AXES, Column, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_gain, noise_ratio, white_smoothness
+from leafflow_ti.sampling import (
+    Sampling, column_noise, cross_noise, difference_variance, noise_gain, noise_ratio, white_smoothness,
+)  # fmt: skip
 from leafflow_ti.stages.estimators import ESTIMATORS
 
 BATCH_BYTES = 8 << 20
@@ -211,6 +213,10 @@ class EstimateStage:
         self.values[Value.F], self.values[Value.PX], self.values[Value.PY] = view.f_px, *view.principal_px
         self.values[Value.BASELINE : Value.BASELINE + 2] = view.baseline_mm
         self.values[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
+        for k, axis in enumerate(("x", "y")):
+            window = self.problem.sampling.axis(axis)
+            factors = [difference_variance(window, 2 * view.step, int(o == axis)) for o in ("1", *AXES)]
+            self.values[Value.DIFFERENCE + 6 * k : Value.DIFFERENCE + 6 * (k + 1)] = np.sqrt(factors)
         self._number = self.device.array(self.numbers, "int")
         self._value = self.device.array(self.values, "algebra")
 
