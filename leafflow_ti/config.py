@@ -170,7 +170,8 @@ class WindowSection(_Section):
 class FiltersSection(_Section):
     """Derivative filters per axis; "auto" takes the largest set up to ``taps`` that the number of samples allows.
 
-    ``prefilter`` of every image, with a Gaussian of ``sigma_pre`` pixels.
+    ``prefilter`` of every image, with a Gaussian of ``sigma_pre`` pixels. On the cube under a spotlight, 8 are the best of
+    2 to 32: below, texture is lost; above, light and the dark beside the cube are left.
     """
 
     taps: _Taps = "5"

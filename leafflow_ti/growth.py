@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ Array = NDArray[np.float64]
 
 VELOCITY = ("velocity_x", "velocity_y", "velocity_z")
 DIFFERENCES = tuple(f"difference_{axis}_{pair}" for axis in "xy" for pair in ("xx", "xy", "yy", "xz", "yz", "zz"))
-"""Covariances of the central differences of the velocity along x and y [mm²/(frame px)²], packed: no maps of results."""
+"""Covariances of the velocity's central differences along x and y [mm²/(frame px)²], packed; no maps of results."""
 INPUTS = ("depth", *VELOCITY, *DIFFERENCES)
 
 
@@ -76,7 +77,7 @@ class Differences:
 
 
 def growth_maps(
-    maps: Mapping[str, NDArray[np.floating]],
+    maps: Mapping[str, NDArray[Any]],
     y: range,
     x: range,
     f_px: float,
@@ -97,7 +98,10 @@ def growth_maps(
     p, q = ([d.of(v) for v in velocity] for d in (across, down))
     ends = [_element(a, b, p, q, half) for half in (0.5, -0.5)]
     ratio = ends[0].area / ends[1].area
-    gradient = [[0.5 * (one + two) for one, two in zip(*sides, strict=True)] for sides in zip(*(e.by for e in ends))]
+    gradient = [
+        [0.5 * (one + two) for one, two in zip(*sides, strict=True)]
+        for sides in zip(*(e.by for e in ends), strict=True)
+    ]
     variance = _both_one_sided(across, down, sampling, packed, gradient)
     for d, window, cov, g in zip((across, down), (sampling.x, sampling.y), packed, gradient, strict=True):
         variance = variance + d.variance(window) * _form(cov, g, g)
@@ -137,7 +141,11 @@ def _form(packed: list[Array], u: list[Array], v: list[Array]) -> Array:
 
 
 def _both_one_sided(
-    across: Differences, down: Differences, sampling: Sampling, packed: tuple[list[Array], ...], gradient: list[list[Array]]
+    across: Differences,
+    down: Differences,
+    sampling: Sampling,
+    packed: tuple[list[Array], ...],
+    gradient: list[list[Array]],
 ) -> Array:
     """What the covariance between differences along x and y adds to the variance, [h, w].
 
@@ -151,7 +159,7 @@ def _both_one_sided(
     return side * factor * 2 * _form(total, *gradient)
 
 
-def _moved(values: NDArray, axis: int, by: int, empty: object) -> NDArray:
+def _moved(values: NDArray[Any], axis: int, by: int, empty: object) -> NDArray[Any]:
     """``values[i + by]`` along an axis, ``empty`` where that is outside."""
     out = np.full_like(values, empty)
     to, source = [slice(None)] * 2, [slice(None)] * 2

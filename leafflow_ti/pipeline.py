@@ -198,10 +198,11 @@ class Pipeline:
                 framed[name][place] = values
         if plan.margin:
             geometry, sampling = plan.geometry, plan.problem.sampling
-            framed.update(growth_maps(framed, y, x, geometry.f_px, geometry.principal_px, sampling))
+            growth = growth_maps(framed, y, x, geometry.f_px, geometry.principal_px, sampling)
+            framed.update({name: values.astype(np.float32) for name, values in growth.items()})
         unit = plan.y[plan.band(band)]
         inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
-        return {n: np.ascontiguousarray(framed[n][inner], np.float32) for n in plan.names}, codes[inner].copy()
+        return {n: framed[n][inner].copy() for n in plan.names}, codes[inner].copy()
 
     def _read(
         self, t: int, band: Band, corner: tuple[int, int], prefilter: Prefilter | None
@@ -228,9 +229,7 @@ class Pipeline:
             block = np.where(finite, block, 0)
         return block, finite.all(axis=(0, 1))
 
-    def _require_positive(
-        self, block: NDArray[Any], valid: NDArray[np.bool_], t: int, corner: tuple[int, int]
-    ) -> None:
+    def _require_positive(self, block: NDArray[Any], valid: NDArray[np.bool_], t: int, corner: tuple[int, int]) -> None:
         """Raise InputError for the first grey value that has no logarithm."""
         wrong = valid & (block <= 0)
         if not wrong.any():
@@ -248,7 +247,9 @@ class Pipeline:
     def _seen(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which rows ``y`` [cameras along y, n] and columns ``x`` [cameras along x, n] of blocks lie inside images."""
         capture, shift = self.capture, self.plan.preshift
-        rows, cols = (np.array(cameras)[:, None] - n for cameras, n in zip(self.plan.cameras, capture.reference))
+        rows, cols = (
+            np.array(cameras)[:, None] - n for cameras, n in zip(self.plan.cameras, capture.reference, strict=True)
+        )
         in_y, in_x = y + shift[1] * rows, x + shift[0] * cols
         return (in_y >= 0) & (in_y < capture.height), (in_x >= 0) & (in_x < capture.width)
 
@@ -256,7 +257,7 @@ class Pipeline:
         """Where every camera sees its image, and where the mask allows a measurement: [in_rows, in_cols]."""
         capture = self.capture
         y, x = corner[0] + np.arange(band.in_rows), corner[1] + np.arange(band.in_cols)
-        in_y, in_x = (seen.all(axis=0) for seen in self._seen(y, x))
+        in_y, in_x = (np.logical_and.reduce(seen) for seen in self._seen(y, x))
         inside = in_y[:, None] & in_x
         if self._mask is None:
             return inside, np.ones_like(inside)

@@ -87,12 +87,12 @@ class Plan:
         if "x" in problem.terms:
             names += ["slope_x", "slope_y"]
         names += MOTION_NAMES[: problem.unknowns]
-        if "depth" in names and problem.unknowns >= 3:
-            names.append("growth_rate")
         if "t" in problem.columns.solutions:
             names += ["flow_x", "flow_y"]
         if problem.columns.index("i") is not None:
             names += [f"brightness_{a}" for a in problem.columns.solutions]
+        if "depth" in names and problem.unknowns >= 3:
+            names.append("growth_rate")
         return tuple(names)
 
     @property
@@ -168,7 +168,7 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     _check_model(name, capture)
     if config.filters.prefilter == "highpass" and config.model.brightness != "none":
         raise ConfigError(
-            f"brightness '{config.model.brightness}' relates changes to the grey value, which prefilter 'highpass' takes "
+            f"brightness '{config.model.brightness}' is relative to the grey value, which prefilter 'highpass' takes "
             "away: choose prefilter homomorphic, or brightness none"
         )
     row, col = capture.reference

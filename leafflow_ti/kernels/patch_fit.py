@@ -250,9 +250,7 @@ def patch_fit_kernel(spec: KernelSpec):
         small.solve(ws, normal, q, n, 1, stride)
 
     @ti.func
-    def propagate(
-        base: ti.i32, cov: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()
-    ):
+    def propagate(base: ti.i32, cov: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()):
         """Covariance [n, n] at ``cov`` of the solution for the covariance of the rows in SPREAD."""
         n = number[Number.UNKNOWNS]
         weighted = base + number[Region.WEIGHTED] * stride

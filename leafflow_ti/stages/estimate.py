@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from leafflow_ti.models import AXES, Column, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import (
-    Sampling, column_noise, cross_noise, difference_variance, noise_gain, noise_ratio, white_smoothness,
+    Sampling,
+    column_noise,
+    cross_noise,
+    difference_variance,
+    noise_gain,
+    noise_ratio,
+    white_smoothness,
 )  # fmt: skip
 from leafflow_ti.stages.estimators import ESTIMATORS
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import correlate1d, minimum_filter
 
 from leafflow_ti.models import AXES, ColumnSet
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio
+from leafflow_ti.sampling import Sampling, column_noise, cross_noise, difference_variance, noise_ratio
 from leafflow_ti.stages import estimate
 
 ARRAY_AXIS = {"t": 0, "sy": 1, "sx": 2, "y": 3, "x": 4}
@@ -230,7 +230,9 @@ def fit_motion(
     passes=4,
     caution=1.0,
 ):
-    """The first ``n`` of (N, Ω, A) and their covariance; ``geometry`` is what fit_geometry returned.
+    """The first ``n`` of (N, Ω, A), how they follow from the rows, G, and the rows' covariance C: theirs is G C G^T.
+
+    ``geometry`` is what fit_geometry returned.
 
     The rows' covariance holds the noise of the motion parameters, of the geometry that the design is built from, and
     what both have in common. The weights leave the common part out: b_t and a_s measure the same mixed derivative with
@@ -271,7 +273,7 @@ def fit_motion(
         W = np.linalg.inv(spread * np.outer(factors, factors)) if weighted else np.eye(len(value))
         G = np.linalg.solve(A.T @ W @ A, A.T @ W)
         q = G @ value
-    return q, G @ total @ G.T
+    return q, G, total
 
 
 def solve(J, columns: ColumnSet, sampling: Sampling, estimator):
@@ -320,12 +322,39 @@ def measure(J, rho, problem, view, x, y):
         put("slope_x", lambda g: surface(x0, y0, f, *g)[1])
         put("slope_y", lambda g: surface(x0, y0, f, *g)[2])
     if problem.unknowns:
-        q, cov_q = fit_motion(
-            x0, y0, f, P, cov, columns, geometry, problem.offsets, problem.use_range, problem.unknowns,
-            view.baseline_mm, view.shift_px, problem.weighted, problem.passes,
-            estimate.RANGE_CAUTION,
-        )  # fmt: skip
+        q, G, total = motion_of(P, cov, geometry, problem, view, x0, y0)
+        cov_q = G @ total @ G.T
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
         for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=True):
             found[name] = (value, error)
+    return found
+
+
+def motion_of(P, cov, geometry, problem, view, x0, y0):
+    """What fit_motion returns for a problem and a view."""
+    return fit_motion(
+        x0, y0, view.f_px, P, cov, problem.columns, geometry, problem.offsets, problem.use_range, problem.unknowns,
+        view.baseline_mm, view.shift_px, problem.weighted, problem.passes, estimate.RANGE_CAUTION,
+    )  # fmt: skip
+
+
+def velocity_differences(J, rho, problem, view, x, y):
+    """Covariances of the velocity's central differences at a pixel: name -> (value, geometric mean of its variances).
+
+    A row with an offset along the axis is a first moment of its window, every other one a mean.
+    """
+    columns, sampling = problem.columns, problem.sampling
+    P, variance = solve(J, columns, sampling, problem.estimator)
+    cov = covariances(J, variance, columns, sampling, rho, estimate.DENOISE[problem.estimator])
+    geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
+    _, G, total = motion_of(P, cov, geometry, problem, view, x - view.principal_px[0], y - view.principal_px[1])
+    found = {}
+    for axis in ("x", "y"):
+        window = problem.sampling.axis(axis)
+        powers = [int(o == axis) for o in problem.offsets] * 2 + [0] * problem.use_range
+        factor = np.sqrt([difference_variance(window, 2 * view.step, power) for power in powers])
+        C = G @ (total * np.outer(factor, factor)) @ G.T
+        for a, b in ("xx", "xy", "yy", "xz", "yz", "zz"):
+            i, j = "xyz".index(a), "xyz".index(b)
+            found[f"difference_{axis}_{a}{b}"] = (C[i, j], np.sqrt(C[i, i] * C[j, j]))
     return found
