@@ -137,7 +137,7 @@ class Pipeline:
         sy, sx = (slice(-f - axis.radius, -f + axis.radius + 1) for f, axis in zip(
             first, (problem.sampling.sy, problem.sampling.sx), strict=True
         ))  # fmt: skip
-        estimate = EstimateStage(self.device, problem, plan.layout, view)
+        estimate = EstimateStage(self.device, problem, plan.layout, view, bool(plan.margin))
         return _Engine(prefilter, tensor, stages, estimate, (sy, sx), places)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:

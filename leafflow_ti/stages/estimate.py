@@ -146,13 +146,14 @@ class _Tables:
 class EstimateStage:
     """Maps of ``Output`` planes [rows, pitch] from the packed tensors of ``TensorStage``.
 
-    One tensor of the reference model, and one of each camera's own flow where the problem has them.
+    One tensor of the reference model, and one of each camera's own flow where the problem has them. ``differences``:
+    the covariances of the velocity's difference quotients are wanted, too; growth needs them.
     """
 
-    def __init__(self, device: Device, problem: Problem, layout: TensorLayout, view: View):
+    def __init__(self, device: Device, problem: Problem, layout: TensorLayout, view: View, differences: bool = True):
         from leafflow_ti.kernels.workspace import Layout
 
-        self.device, self.problem, self.view = device, problem, view
+        self.device, self.problem, self.view, self.differences = device, problem, view, differences
         columns, own = problem.columns, problem.own_flows
         rows = self._rows()
         n_rows = [2 * len(problem.offsets) + problem.use_range] + ([2 * len(own.offsets)] if own else [])
@@ -343,6 +344,7 @@ class EstimateStage:
             for tables, one in zip(self._own, own_tensors, strict=True):
                 tables.tensor = one
         covariance, maps = covariance_kernels(device.dense), maps_kernels(device.dense)
+        differences = DIFFERENCES if self.differences else 0
         for first in range(0, n_pixels // lanes, self._groups):
             groups = min(self._groups, n_pixels // lanes - first)
             step, stride = (self.layout.n_elements * lanes, lanes) if not device.gpu else (1, groups)
@@ -377,16 +379,16 @@ class EstimateStage:
                 fit = patch_fit_kernel(device.dense)
                 for i in range(problem.passes):
                     last = i == problem.passes - 1 and not own
-                    launch(fit, which=(START if i == 0 else CLEAR) | FINISH | (DIFFERENCES if last else 0))
+                    launch(fit, which=(START if i == 0 else CLEAR) | FINISH | (differences if last else 0))
             launch(maps.measured)
             if own:
                 if own.reference_rows:
-                    launch(fit, self._final, which=CLEAR | DIFFERENCES)
+                    launch(fit, self._final, which=CLEAR | differences)
                 for i, tables in enumerate(self._own):
                     flow_of(tables, 0)
                     clear = CLEAR if i == 0 and not own.reference_rows else 0
                     finish = FINISH if i == len(self._own) - 1 else 0
-                    launch(fit, tables, which=clear | DIFFERENCES | finish)
+                    launch(fit, tables, which=clear | differences | finish)
             if problem.unknowns:
                 launch(maps.motion, self._final if own else self.reference)
         planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)
