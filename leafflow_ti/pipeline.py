@@ -305,7 +305,7 @@ class Pipeline:
         maps = {}
         for name in self._names:
             base = name.removesuffix("_std")
-            plane = _plane_of(base, self.plan.problem.columns.solutions) + (Output.STD if name != base else 0)
+            plane = _plane_of(base) + (Output.STD if name != base else 0)
             maps[name] = planes[plane].astype(np.float32)
         has_value = np.isin(status, HAS_VALUE)
         for values in maps.values():
@@ -314,7 +314,7 @@ class Pipeline:
         return maps, status
 
 
-def _plane_of(name: str, solutions: tuple[str, ...]) -> int:
+def _plane_of(name: str) -> int:
     from leafflow_ti.kernels.maps import Output
     from leafflow_ti.plan import MOTION_NAMES
 
@@ -322,8 +322,6 @@ def _plane_of(name: str, solutions: tuple[str, ...]) -> int:
         return Output.MOTION + MOTION_NAMES.index(name)
     if name in DIFFERENCES:
         return Output.DIFFERENCES + DIFFERENCES.index(name)
-    if name.startswith("brightness_"):
-        return Output.BRIGHTNESS + solutions.index(name.removeprefix("brightness_"))
     return int(Output[name.upper()])
 
 
