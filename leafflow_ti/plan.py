@@ -13,7 +13,7 @@ import numpy as np
 from leafflow_ti.capture import Capture, Geometry, find_preshift
 from leafflow_ti.config import RunConfig, resolve_model
 from leafflow_ti.errors import ConfigError, InputError
-from leafflow_ti.filters import choose_filter_set, filter_set, gaussian_radius
+from leafflow_ti.filters import choose_filter_set, filter_set
 from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set, parse_rows
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
@@ -101,12 +101,6 @@ class Plan:
     def margin(self) -> int:
         """Output pixels around a band, and around the region, that are computed for the sake of those inside."""
         return int(any(name.startswith("growth") for name in self.names))
-
-    @property
-    def prefilter_radius(self) -> int:
-        """Pixels that a prefilter needs around the images' blocks."""
-        filters = self.config.filters
-        return 0 if filters.prefilter == "none" else gaussian_radius(filters.sigma_pre)
 
     def band(self, index: int) -> slice:
         """Output rows of one band."""
