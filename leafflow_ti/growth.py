@@ -8,6 +8,10 @@ frame it moves with the velocity ``f(x, y)`` from ``s - f/2`` to ``s + f/2``:
 The printed forward step, from s to s + f, takes a rotation by ω about an axis in the surface for a growth of ω²/2; the
 centred one is exactly zero for every rigid motion.
 
+It is as good as the velocity: a motion fit to the flow's derivatives along x and y (rows ``2d``) takes an image that
+grows for a rigid patch that comes nearer, which hides growth; the flows of all cameras (``scene-flow``) or the flow
+itself with the range constraint (rows ``u+b5``) do not.
+
 Derivatives are central differences over the neighbouring output pixels, one-sided where one of the two has no value.
 Where both are missing along x or along y there is no growth rate: NaN, and NaN its standard error.
 
