@@ -51,6 +51,10 @@ Border = Annotated[
     _text("border", "full|clip", "Where the whole window is inside, or up to the border [full]."),
 ]
 Taps = Annotated[str | None, _text("taps", "3x1x1|3|5|7", "Derivative filters [5].")]
+Prefilter = Annotated[
+    str | None, _text("prefilter", "none|highpass|homomorphic", "Filter of every image against uneven light [none].")
+]
+SigmaPre = Annotated[float | None, _text("sigma-pre", "PIXELS", "Gaussian width of the prefilter [8].")]
 Frames = Annotated[str | None, _text("frames", "A:B", "Frame indices to measure, B excluded [all].")]
 Roi = Annotated[str | None, _text("roi", "x0,y0,x1,y1", "Pixels to measure, x1 and y1 excluded [all].")]
 Mask = Annotated[str | None, _text("mask", "FILE", "Image whose zero pixels are left out.")]
