@@ -27,6 +27,7 @@ ModelName = Literal[
 ]  # fmt: skip
 Motion = Literal["auto", "translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
+Deformation = Literal["auto", "none", "growth"]
 BrightnessTerms = Literal["none", "time", "space", "both"]
 Estimator = Literal["ols", "tls", "tls-equilibrated"]
 Solver = Literal["fast", "jacobi"]
@@ -127,11 +128,13 @@ class ModelSection(_Section):
     """Which parameters are estimated, and how.
 
     ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its derivatives along x, y) followed by
-    any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can.
+    any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can. ``deformation`` growth:
+    the patch may grow in its plane, one more unknown; auto: where the flows of all cameras are there to tell.
     """
 
     name: ModelName = "auto"
     motion: Motion = "auto"
+    deformation: Deformation = "auto"
     rows: str = "auto"
     brightness: Brightness = "none"
     brightness_terms: BrightnessTerms = "none"

@@ -141,7 +141,8 @@ class Plan:
                     f"{2 * len(own.offsets)} rows ({'+'.join(own.offsets)}) of each of {len(own.steps)} cameras' own "
                     f"flow, {own.columns.n} columns"
                 )
-            lines.append(f"motion      {problem.unknowns} unknowns from {' and '.join(taken)}")
+            growing = " and growth" if own and own.growth else ""
+            lines.append(f"motion      {problem.unknowns} unknowns{growing} from {' and '.join(taken)}")
         pixels = len(self.frames) * len(self.y) * len(self.x)
         limit = self.config.plan.max_memory
         filters = self.config.filters
@@ -209,6 +210,10 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
                 f"motion '{motion}' has {fitted} unknowns, rows '{config.model.rows}' give {n_rows} equations: choose "
                 "more rows, a simpler motion, or more frames and cameras"
             )
+    if config.model.deformation == "growth" and own is None:
+        raise ConfigError(
+            f"deformation 'growth': model '{name}' cannot tell it from approach: choose affine-scene-flow"
+        )
     problem = Problem(
         columns, sampling, config.model.estimator, config.model.solver, config.model.weighting == "wls",
         offsets, use_range, fitted, own,
@@ -262,7 +267,10 @@ def _own_flows(
         steps.remove((0, 0))
     unknowns = {"translation": 3, "rotation": 6, "acceleration": 9}[motion]
     kept = tuple(o for o in offsets if o == "1" or columns.index("x", o) is not None)
-    return OwnFlows(columns, alone, tuple(steps), kept, unknowns, model.reference_rows)
+    growth = "x" in kept if config.model.deformation == "auto" else config.model.deformation == "growth"
+    if growth and "x" not in kept:
+        raise ConfigError("deformation 'growth' is seen in the flow's derivatives: choose rows that begin with 2d")
+    return OwnFlows(columns, alone, tuple(steps), kept, unknowns, model.reference_rows, growth)
 
 
 def _cameras(sampling: Sampling, own: OwnFlows | None, row: int, col: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

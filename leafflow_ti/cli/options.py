@@ -29,6 +29,10 @@ Motion = Annotated[
     str | None,
     _text("motion", "auto|translation|rotation|acceleration", "Unknowns of the 3D motion [auto: rotation, if it can]."),
 ]
+Deformation = Annotated[
+    str | None,
+    _text("deformation", "auto|none|growth", "Whether the surface may grow [auto: growth with affine-scene-flow]."),
+]
 Rows = Annotated[
     str | None, _text("rows", "auto|(u|2d)[+b5][+as][+at]", "Flow parameters that enter the 3D fit [auto].")
 ]

@@ -37,6 +37,7 @@ def run(
     preset: options.Preset = None,
     model: options.Model = None,
     motion: options.Motion = None,
+    deformation: options.Deformation = None,
     rows: options.Rows = None,
     brightness: options.Brightness = None,
     brightness_terms: options.BrightnessTerms = None,

@@ -213,10 +213,12 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
         """Write the planes of the motion."""
         n = number[Number.UNKNOWNS]
         for i in range(lanes):
-            for j in range(n):
-                q = base + (number[Region.MOTION] + j) * stride + i
-                cov = base + (number[Region.MOTION_COV] + j * n + j) * stride + i
-                put(out, Output.MOTION + j, pixel + i, n_pixels, ws[q], ws[cov])
+            for j in range(9):
+                place = number[Number.PLACE + j]
+                if place >= 0:
+                    q = base + (number[Region.MOTION] + j) * stride + i
+                    cov = base + (number[Region.MOTION_COV] + place * n + place) * stride + i
+                    put(out, Output.MOTION + j, pixel + i, n_pixels, ws[q], ws[cov])
             if n >= 3:
                 for axis in range(2):
                     for r in range(3):

@@ -16,7 +16,7 @@ from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
 BLOCK = 4
 """Vectors that the block inverse iteration carries: the solutions and at least one guard."""
-MAX_UNKNOWNS = 9
+MAX_UNKNOWNS = 10
 MAX_ROWS = 16
 MAX_COLUMNS = 32
 MAX_SQUARES = 8
@@ -24,7 +24,7 @@ MAX_SQUARES = 8
 
 class Region(IntEnum):
     """Regions; shapes with N columns, k solutions, F = N - k, S and T rows of a camera solution
-    and of the motion solution, G geometry terms, M equations of the motion fit."""
+    and of the motion solution, G geometry terms, M equations and Q unknowns of the motion fit."""
 
     TENSOR = 0  # packed [N]: scaled structure tensor, then its Cholesky factor
     VECTORS = auto()  # [N, BLOCK]: iterated vectors
@@ -54,20 +54,20 @@ class Region(IntEnum):
     GEOMETRY_COV = auto()  # [G, G]
     GEOMETRY_CROSS = auto()  # [G, T]
     GEOMETRY_WORK = auto()  # [S, G]
-    MOTION = auto()  # [9]
-    MOTION_COV = auto()  # [9, 9]
-    DIFFERENCE_COV = auto()  # [2, 9, 9]: of difference quotients of the motion along x and y
-    DESIGN = auto()  # [M, 9]
+    MOTION = auto()  # [Q]
+    MOTION_COV = auto()  # [Q, Q]
+    DIFFERENCE_COV = auto()  # [2, Q, Q]: of difference quotients of the motion along x and y
+    DESIGN = auto()  # [M, Q]
     VALUE = auto()  # [M]
     LEFT_OUT = auto()  # [M]: standard size of what each equation leaves out
-    WEIGHTED = auto()  # [M, 9]: weights times design
+    WEIGHTED = auto()  # [M, Q]: weights times design
     OWN = auto()  # packed [M]: covariance of the rows without what they owe to the geometry
     FACTOR = auto()  # packed [M]: of the weights' inverse
     DERIVATIVE = auto()  # [M, G]
-    MOTION_WORK = auto()  # [M, 9], packed [9]
-    NORMAL = auto()  # [9, 9]; from here on: sums over the sets of rows of the motion fit
-    NORMAL_RHS = auto()  # [9]
-    NORMAL_SPREAD = auto()  # [3, 9, 9]: for the motion and its difference quotients along x and y, as the next two
+    MOTION_WORK = auto()  # [M, Q], packed [Q]
+    NORMAL = auto()  # [Q, Q]; from here on: sums over the sets of rows of the motion fit
+    NORMAL_RHS = auto()  # [Q]
+    NORMAL_SPREAD = auto()  # [3, Q, Q]: for the motion and its difference quotients along x and y, as the next two
     LEFT = auto()  # [3, G + F, 9]: by the errors of the geometry, of the reference's normal equations
     RIGHT = auto()  # [3, G + F, 9]: what is correlated with them
     REFERENCE_VARIANCE = auto()  # [1]
@@ -198,7 +198,8 @@ class Number(IntEnum):
     CENTRE = BRIGHTNESS_PLANES + 4  # MAX_SQUARES x 2: column of the constant, column of the square
     MOVE = CENTRE + 2 * MAX_SQUARES  # 2 x 2: columns of the flow's derivatives along x, y
     PARTNER = MOVE + 4  # MAX_COLUMNS: column of an own flow for each column of the reference model, or -1
-    LOWER = PARTNER + MAX_COLUMNS  # N (N + 1) / 2: plane of each element of the lower triangle
+    PLACE = PARTNER + MAX_COLUMNS  # MAX_UNKNOWNS: where each component of the motion stands among the unknowns, or -1
+    LOWER = PLACE + MAX_UNKNOWNS  # N (N + 1) / 2: plane of each element of the lower triangle
     # Behind them NOISE_TERMS x 2: element of the lower triangle, plane of J.
 
 

@@ -60,7 +60,8 @@ MAX_RESIDUAL_PX = 0.5
 class OwnFlows:
     """The flows of single cameras in the motion fit (6.15): their data vector, and where the cameras stand.
 
-    ``steps``: (x, y) steps of each camera from the reference. ``offsets``: of their rows. ``unknowns`` of the fit.
+    ``steps``: (x, y) steps of each camera from the reference. ``offsets``: of their rows. ``unknowns``: components of
+    (N, Ω, A) in the fit; ``growth``: and the rate at which the patch grows in its plane.
     ``reference_rows``: the rows of the reference model take part, too.
     """
 
@@ -70,6 +71,7 @@ class OwnFlows:
     offsets: tuple[str, ...]
     unknowns: int
     reference_rows: bool
+    growth: bool = False
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,8 @@ class EstimateStage:
         if own:
             # The same rows among all unknowns.
             self._final = _Tables(self.reference.number.copy(), self.reference.value)
-            self._set_numbers(self._final.number, UNKNOWNS=own.unknowns, CORRELATED=columns.n_flow)
+            self._set_numbers(self._final.number, CORRELATED=columns.n_flow)
+            self._set_unknowns(self._final.number, own.unknowns, own.growth)
             self._own = self._own_tables(own)
             self._all_tables += [self._final, *self._own]
         self.set_view(view)
@@ -240,6 +243,17 @@ class EstimateStage:
 
         for name, entry in entries.items():
             number[Number[name]] = entry
+
+    @staticmethod
+    def _set_unknowns(number: NDArray[np.int32], n: int, growth: bool = False) -> None:
+        """The unknowns are the first ``n`` components of (N, Ω, A), and the growth behind them."""
+        from leafflow_ti.kernels.patch_fit import GROWTH
+        from leafflow_ti.kernels.workspace import Number
+
+        number[Number.UNKNOWNS] = n + growth
+        number[Number.PLACE : Number.PLACE + n] = range(n)
+        if growth:
+            number[Number.PLACE + GROWTH] = n
 
     def _tables(
         self, columns: ColumnSet, sampling: Sampling, layout: TensorLayout, offsets: Sequence[str], rows: Sequence[int]
@@ -299,11 +313,12 @@ class EstimateStage:
         brightness = columns.index("i")
         self._set_numbers(
             number, ROWS_S=len(rows.camera[0]) if rows.camera else 0, USE_RANGE=problem.use_range,
-            UNKNOWNS=problem.fitted, BRIGHTNESS_COLUMN=-1 if brightness is None else brightness,
+            BRIGHTNESS_COLUMN=-1 if brightness is None else brightness,
             BRIGHTNESS_ROWS=len(problem.brightness), WORLD_ROW=2 * len(problem.offsets) + 1,
             WORLD_MAPS=len(problem.world_brightness), CAMERA_SOLUTIONS=len(problem.camera_axes),
             RANGE_TERM=problem.terms.index("t") if "t" in problem.terms else -1,
         )  # fmt: skip
+        self._set_unknowns(number, problem.fitted)
         planes = [Output[BRIGHTNESS_MAPS[o].upper()] - Output.BRIGHTNESS_T for o in problem.brightness]
         number[Number.BRIGHTNESS_PLANES : Number.BRIGHTNESS_PLANES + len(planes)] = planes
         for k, axis in enumerate(problem.camera_axes):
@@ -328,7 +343,8 @@ class EstimateStage:
             own.columns, own.sampling, TensorLayout.of(own.columns), own.offsets, [i for i in rows if i is not None]
         )
         correlated = columns.n_flow if own.reference_rows else 0
-        self._set_numbers(common.number, OWN_FLOW=1, UNKNOWNS=own.unknowns, CORRELATED=correlated)
+        self._set_numbers(common.number, OWN_FLOW=1, CORRELATED=correlated)
+        self._set_unknowns(common.number, own.unknowns, own.growth)
         moves = [own.columns.index(c, o) for c in ("x", "y") for o in ("x", "y")]
         common.number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
         found = []
