@@ -15,7 +15,7 @@ leads from there to the value at the centre.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 
@@ -39,6 +39,7 @@ class Model:
     ``offsets``: the axes along which the flow varies inside a window, ``"s"`` standing for every camera axis.
     ``cameras``: ``"reference"`` (one camera), ``"line"`` (the row or column through the reference camera) or
     ``"grid"``. ``curvature``: further flow columns, (channel, offset).
+    ``ranges``: measures on maps of the range too; its columns are those of ``range_flow``.
     """
 
     offsets: tuple[str, ...]
@@ -46,6 +47,7 @@ class Model:
     time: bool
     summary: str
     curvature: tuple[tuple[str, str], ...] = ()
+    ranges: bool = False
 
 
 MODELS: dict[str, Model] = {
@@ -60,6 +62,7 @@ MODELS: dict[str, Model] = {
     "affine": Model(("x", "y"), "grid", True, "depth, normals and motion (3.38), (3.39)"),
     "affine-4d": Model(("x", "y", "s", "t"), "line", True, "4D affine model (5.24)"),
     "affine-5d": Model(("x", "y", "s", "t"), "grid", True, "5D affine model (6.10)"),
+    "range-flow": Model((), "grid", True, "motion from range and intensity (3.9)-(3.18), (4.20)-(4.25)", ranges=True),
 }  # fmt: skip
 """``flow-quadratic``: the flow of a plane has ``(q1 x² + q2 xy, q1 xy + q2 y²)`` (2.8); here the four coefficients are
 independent."""
@@ -122,11 +125,29 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Derived:
+    """A channel that is made of a stack of images: the derivative along ``axis`` of one of them, times a plane.
+
+    ``axis`` ``i`` is the smoothed image, ``1`` a constant; ``image`` and ``factor`` count in the stacks of images and
+    of factor planes (None: no factor). ``gain``: noise variance per variance of the image noise.
+    """
+
+    image: int
+    axis: str
+    factor: int | None
+    gain: float
+
+
+@dataclass(frozen=True)
 class ColumnSet:
-    """The data vector of one model on one sampling: ``columns`` with the ``n_time_like`` time-like ones last."""
+    """The data vector of one model on one sampling: ``columns`` with the ``n_time_like`` time-like ones last.
+
+    ``derived``: how each channel is made where the images of a frame are a stack of several kinds, the intensity first.
+    """
 
     columns: tuple[Column, ...]
     n_time_like: int
+    derived: Mapping[str, Derived] = field(default_factory=dict, hash=False)
 
     @property
     def n(self) -> int:

@@ -32,6 +32,7 @@ CASES = [
     if (row.cameras == "reference") == (grid == "single")
     if model != "affine-5d" or grid == "square"
     if row.time or brightness != "temporal"
+    if not row.ranges
 ]
 """Every model with every brightness model and every grid that it exists for."""
 

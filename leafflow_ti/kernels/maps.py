@@ -199,7 +199,7 @@ def maps_kernel(spec: KernelSpec):
                     variance = ws[base + (number[Region.BRIGHTNESS_VARIANCE] + j) * stride + i]
                     put(out, Output.BRIGHTNESS_SX + number[Number.CAMERA_AXIS + j], at, n_pixels, -ws[p], variance)
             for j in range(number[Number.BRIGHTNESS_ROWS]):
-                row = 2 * number[Number.OFFSETS] + j
+                row = number[Number.MOTION_FLOW] + j
                 p = parameter(base, row, stride, number)
                 plane = Output.BRIGHTNESS_T + number[Number.BRIGHTNESS_PLANES + j]
                 put(out, plane, at, n_pixels, -ws[p + i], ws[rows + tri(row, row) * stride])

@@ -153,7 +153,8 @@ class Number(IntEnum):
     TERMS = auto()  # G: geometry terms (1, x, y, t), 0 without a grid
     OFFSETS = auto()  # number of motion offsets
     ROWS_S = auto()  # rows of a camera solution: 2 G, and one for brightness if the model has it
-    ROWS_T = auto()  # rows of the motion solution: 2 OFFSETS + BRIGHTNESS_ROWS
+    ROWS_T = auto()  # rows of the motion solution: MOTION_FLOW + BRIGHTNESS_ROWS
+    MOTION_FLOW = auto()  # its flow rows: 2 OFFSETS; of range flow 3
     USE_RANGE = auto()
     UNKNOWNS = auto()  # of the motion fit; 0 without one
     WEIGHTED = auto()  # weighted least squares, else plain
@@ -202,6 +203,7 @@ class Value(IntEnum):
     ROUGHEST = auto()  # share of the gradient's energy that one more smoothing leaves, below which it is noise
     MAX_RESIDUAL = auto()  # px, for status incoherent
     MAX_SHIFT = auto()  # px per step or frame, likewise
+    MOTION_SCALE = auto()  # mm per px of range flow's unknowns
     GAP = auto()  # convergence: residual per gap
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.models import AXES, Column, ColumnSet, TensorLayout
+from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_gain, noise_ratio, white_smoothness
+from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio, white_smoothness
 from leafflow_ti.stages.estimators import ESTIMATORS
 
 BATCH_BYTES = 8 << 20
@@ -47,6 +47,7 @@ class Problem:
     """What is estimated: columns, geometry terms, motion rows; independent of band and device.
 
     ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``unknowns`` of the motion fit (0: none).
+    ``range_scale``: of range flow, mm per px at its working distance.
     """
 
     columns: ColumnSet
@@ -59,6 +60,7 @@ class Problem:
     unknowns: int = 0
     passes: int = 3
     iterations: int = 4
+    range_scale: float | None = None
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -167,6 +169,9 @@ class EstimateStage:
             found += [columns.index("i", o) for o in brightness]
             return [i for i in found if i is not None]
 
+        if problem.range_scale is not None:
+            light = [columns.index("i", o) for o in problem.brightness]
+            return SimpleNamespace(motion=[0, 1, 2, *(i for i in light if i is not None)], camera=[])
         motion = both("x", problem.offsets, problem.brightness) if "t" in columns.solutions else []
         camera = [both("x" if a == "sx" else "y", problem.terms, ["1"]) for a in problem.camera_axes]
         return SimpleNamespace(motion=motion, camera=camera)
@@ -185,6 +190,7 @@ class EstimateStage:
         number[Number.TERMS] = len(problem.terms)
         number[Number.OFFSETS] = len(problem.offsets)
         number[Number.ROWS_T] = len(rows.motion)
+        number[Number.MOTION_FLOW] = len(rows.motion) - len(problem.brightness)
         number[Number.ROWS_S] = len(rows.camera[0]) if rows.camera else 0
         number[Number.USE_RANGE] = problem.use_range
         number[Number.UNKNOWNS] = problem.unknowns
@@ -204,16 +210,18 @@ class EstimateStage:
         number[Number.RANGE_TERM] = problem.terms.index("t") if "t" in problem.terms else -1
         number[Number.CAMERA_SOLUTIONS] = len(problem.camera_axes)
         number[Number.EXTRA] = len(layout.entries)
-        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = [columns.columns.index(Column.of(c)) for c in ("x", "y")]
+        flow_rows = [i for c in ("x", "y") if (i := columns.index(c)) is not None]
+        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = flow_rows
+        noise = column_noise(sampling, columns)
         for i, o in enumerate(problem.offsets):
             number[Number.OFFSET_CODES + i] = 0 if o == "1" else 1 + AXES.index(o)
         number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows.motion)] = rows.motion
         number[Number.LOWER : Number.LOWER + len(layout.lower)] = layout.lower
-        noise = column_noise(sampling, columns)
         value[Value.RIDGE], value[Value.GAP], value[Value.STEP_SIZE] = (t[precision] for t in (RIDGE, GAP, STEP_SIZE))
         value[Value.SCALE : Value.SCALE + columns.n] = noise**-0.5
         value[Value.NOISE : Value.NOISE + columns.n] = noise
-        value[Value.GAIN] = noise_gain(sampling, "x")
+        value[Value.GAIN] = noise[flow_rows[0]]
+        value[Value.MOTION_SCALE] = problem.range_scale or 0.0
         value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
         value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
@@ -284,6 +292,7 @@ class EstimateStage:
         from leafflow_ti.kernels.covariance import covariance_kernels
         from leafflow_ti.kernels.maps import Output, maps_kernel
         from leafflow_ti.kernels.patch_fit import patch_fit_kernel
+        from leafflow_ti.kernels.range_motion import range_motion_kernel
 
         device, view, problem = self.device, self.view, self.problem
         lanes = device.dense.lanes
@@ -312,7 +321,9 @@ class EstimateStage:
                 launch(covariance.add_camera, which=camera)
             if problem.camera_axes:
                 launch(covariance.geometry)
-            if problem.unknowns:
+            if problem.range_scale is not None:
+                launch(range_motion_kernel(device.dense))
+            elif problem.unknowns:
                 launch(patch_fit_kernel(device.dense))
             launch(maps_kernel(device.dense))
         planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)
