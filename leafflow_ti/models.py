@@ -38,8 +38,9 @@ class Model:
 
     ``offsets``: the axes along which the flow varies inside a window, ``"s"`` standing for every camera axis.
     ``cameras``: ``"reference"`` (one camera), ``"line"`` (the row or column through the reference camera) or
-    ``"grid"``. ``curvature``: further flow columns, (channel, offset).
-    ``ranges``: measures on maps of the range too; its columns are those of ``range_flow``.
+    ``"grid"``. ``curvature``: further flow columns, (channel, offset). ``motions``: what the 3D fit may solve for, the
+    default first. ``own_flows``: every camera's own flow (6.15) enters the fit; ``reference_rows``: so do the rows of
+    the reference camera. ``ranges``: measures on maps of the range too; its columns are those of ``range_flow``.
     """
 
     offsets: tuple[str, ...]
@@ -47,9 +48,14 @@ class Model:
     time: bool
     summary: str
     curvature: tuple[tuple[str, str], ...] = ()
+    motions: tuple[str, ...] = ()
+    own_flows: bool = False
+    reference_rows: bool = True
     ranges: bool = False
 
 
+ANY_MOTION = ("rotation", "translation", "acceleration")
+OWN_FLOW = Model(("x", "y", "t"), "reference", True, "flow of one camera of the affine scene flow model, 13 columns")
 MODELS: dict[str, Model] = {
     "flow": Model((), "reference", True, "optical flow, constant in the window (2.3)"),
     "flow-affine": Model(("x", "y"), "reference", True, "optical flow, affine in the window (2.6)"),
@@ -58,11 +64,24 @@ MODELS: dict[str, Model] = {
         (("x", "xx"), ("x", "xy"), ("y", "xy"), ("y", "yy")),
     ),
     "depth": Model(("x", "y", "s"), "grid", False, "depth and normals of a static scene"),
-    "affine-translation": Model((), "grid", True, "disparity and flow, constant in the window"),
-    "affine": Model(("x", "y"), "grid", True, "depth, normals and motion (3.38), (3.39)"),
-    "affine-4d": Model(("x", "y", "s", "t"), "line", True, "4D affine model (5.24)"),
-    "affine-5d": Model(("x", "y", "s", "t"), "grid", True, "5D affine model (6.10)"),
-    "range-flow": Model((), "grid", True, "motion from range and intensity (3.9)-(3.18), (4.20)-(4.25)", ranges=True),
+    "affine-translation": Model(
+        (), "grid", True, "disparity and flow, constant in the window", motions=("translation",)
+    ),
+    "affine": Model(("x", "y"), "grid", True, "depth, normals and motion (3.38), (3.39)", motions=ANY_MOTION),
+    "affine-4d": Model(("x", "y", "s", "t"), "line", True, "4D affine model (5.24)", motions=ANY_MOTION),
+    "affine-5d": Model(("x", "y", "s", "t"), "grid", True, "5D affine model (6.10)", motions=ANY_MOTION),
+    "scene-flow": Model(
+        ("x", "y", "s", "t"), "grid", True, "velocity from the flow of every camera (3.4)",
+        motions=("translation",), own_flows=True, reference_rows=False,
+    ),
+    "affine-scene-flow": Model(
+        ("x", "y", "s", "t"), "grid", True, "4D or 5D affine model and the affine flow of every camera (6.15)",
+        motions=ANY_MOTION, own_flows=True,
+    ),
+    "range-flow": Model(
+        (), "grid", True, "velocity from range and intensity (3.9)-(3.18), (4.20)-(4.25)",
+        motions=("translation",), ranges=True,
+    ),
 }  # fmt: skip
 """``flow-quadratic``: the flow of a plane has ``(q1 x² + q2 xy, q1 xy + q2 y²)`` (2.8); here the four coefficients are
 independent."""
@@ -83,7 +102,7 @@ BRIGHTNESS_TERMS: dict[str, tuple[str, ...]] = {
 }
 """Offsets of the optional intensity columns of second order. ``xt`` and ``yt`` need a model with ``x`` and ``y``."""
 
-ROW_AXES: dict[str, tuple[str, ...]] = {"2d": ("x", "y"), "as": ("sx", "sy"), "at": ("t",)}
+ROW_AXES: dict[str, tuple[str, ...]] = {"u": (), "2d": ("x", "y"), "as": ("sx", "sy"), "at": ("t",)}
 """Which offsets of the motion each group of rows uses, besides the motion itself (section 5.2)."""
 
 
@@ -288,18 +307,12 @@ def parse_rows(rows: str, model: str, motion: str, columns: ColumnSet) -> tuple[
         use_range = has_range
     else:
         groups = rows.split("+")
-        use_range = "b5" in groups
-        groups = [g for g in groups if g != "b5"]
         for g in groups:
-            if g not in ROW_AXES:
-                raise ConfigError(
-                    f"rows '{rows}': unknown group '{g}'; allowed are 2d, b5, as, at joined by '+', or auto"
-                )
-            if not have & set(ROW_AXES[g]):
+            measured = has_range if g == "b5" else not ROW_AXES[g] or bool(have & set(ROW_AXES[g]))
+            if not measured:
                 raise ConfigError(
                     f"rows '{rows}': model '{model}' does not measure group '{g}' on this capture; leave it out"
                 )
-        if use_range and not has_range:
-            raise ConfigError(f"rows '{rows}': model '{model}' does not measure b5 on this capture; leave it out")
+        use_range = "b5" in groups
     offsets = ("1", *(a for g in ROW_AXES if g in groups for a in ROW_AXES[g] if a in have))
     return offsets, use_range

@@ -82,7 +82,7 @@ def estimated(device: Device, constraint: str, terms: str, estimator: str = "tls
         SCENE.f_px, (x, y), (0.0, 0.0), (0.0, 0.0), BAND.halo_x, BAND.halo_y, BAND.stride, BAND.rows, BAND.cols,
         stage.out_pitch,
     )  # fmt: skip
-    problem = Problem(columns, SAMPLING, estimator, unknowns=3, range_scale=WORKING / SCENE.f_px)
+    problem = Problem(columns, SAMPLING, estimator, fitted=3, range_scale=WORKING / SCENE.f_px)
     maps = np.array(EstimateStage(device, problem, layout, view)(packed))
     n = (len(layout.entries) + EXTRA_PLANES) * BAND.rows * stage.out_pitch
     planes = np.array(device.host(packed)[:n], np.float64).reshape(-1, BAND.rows, stage.out_pitch)[..., : BAND.cols]

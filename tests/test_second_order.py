@@ -22,7 +22,7 @@ from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
 
 GRID = {"reference": "single", "line": "line-x", "grid": "square"}
 COMBINATIONS = [
-    (model, brightness, terms, GRID[row.cameras])
+    (model, brightness, terms, "line-x" if row.own_flows else GRID[row.cameras])
     for model, row in MODELS.items()
     for brightness in ("temporal", "spatial", "camera")
     for terms in ("time", "space", "both")
@@ -38,8 +38,9 @@ def check(bench: Callable, model: str, brightness: str, terms: str, grid: str, p
     b = bench(model, brightness, grid, precision, terms=terms)
     limit = tolerance(b.device)
     moving = MODELS[model].time and grid != "single"
-    found = b.estimate(("translation" if model == "affine-translation" else "rotation") if moving else None)
-    for pixel in ((0, 0), (2, 4)):
+    found = b.estimate(MODELS[model].motions[0] if moving else None)
+    # Own flows use the workspace after the parameters of the reference model, which are those of the 4D model.
+    for pixel in ((0, 0), (2, 4)) if not found.problem.own_flows else ():
         J, rho = b.reference(*pixel)
         assert relative_error(b.tensor(*pixel), J) <= limit.tensor
         P, variance = chain.solve(J, b.columns, b.sampling, "tls-equilibrated")
