@@ -20,6 +20,7 @@ from leafflow_ti.capture.images import read_gray
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.plan import Plan, Unit
+from leafflow_ti.range_engine import RangeEngine, Sample
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import EstimateStage, View
 from leafflow_ti.stages.tensor import Band, TensorStage
@@ -57,15 +58,17 @@ class _Engine:
     estimate: EstimateStage
     inner: tuple[slice, slice]
     own_cameras: list[tuple[slice, slice]]
+    ranges: RangeEngine | None = None
 
     def reset(self) -> None:
         """Forget all frames."""
         for stage in (self.tensor, *self.own):
             stage.reset()
 
-    def push(self, block: NDArray[Any], valid: NDArray[np.bool_]) -> tuple[Any, list[Any]] | None:
-        """Add a frame [sy, sx, rows, cols] of every camera; the tensors once the windows are full."""
-        tensor = self.tensor.push(block[self.inner], valid)
+    def push(self, sample: Sample) -> tuple[Any, list[Any]] | None:
+        """Add a frame of every camera; the tensors once the windows are full."""
+        block, valid = sample.block, sample.valid
+        tensor = self.tensor.push(block[self.inner], valid, sample.factors)
         own = [stage.push(block[at], valid) for stage, at in zip(self.own, self.own_cameras, strict=True)]
         return None if tensor is None else (tensor, own)
 
@@ -94,10 +97,17 @@ class Pipeline:
             band = Band.of(plan.problem.sampling, 1, 1, plan.config.window.stride)
             engine = self._make_engine(band)
             shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
+            if engine.ranges:
+                shape = (*shape[:2], engine.ranges.outer.in_rows, engine.ranges.outer.in_cols)
+                engine.ranges.move(engine.estimate.view, (0, 0))
             grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
+            ok = np.ones(shape[2:], bool)
+            sample = Sample(grey, ok, np.zeros(shape[2:], np.uint8))
+            if engine.ranges:
+                sample = engine.ranges.sample(plan.frames[0], grey, ok, ok)
             tensors = None
             while tensors is None:
-                tensors = engine.push(grey, np.ones(shape[2:], bool))
+                tensors = engine.push(sample)
             engine.estimate(*tensors)
             self.device.synchronize()
         return self.timings.seconds["compile"]
@@ -126,7 +136,11 @@ class Pipeline:
         sy, sx = (slice(-f - axis.radius, -f + axis.radius + 1) for f, axis in zip(
             first, (problem.sampling.sy, problem.sampling.sx), strict=True
         ))  # fmt: skip
-        return _Engine(tensor, stages, EstimateStage(self.device, problem, plan.layout, view), (sy, sx), places)
+        estimate = EstimateStage(self.device, problem, plan.layout, view)
+        if plan.ranges is None:
+            return _Engine(tensor, stages, estimate, (sy, sx), places)
+        ranges = RangeEngine(self.device, plan.ranges, problem.sampling, plan.geometry.f_px, band)
+        return _Engine(tensor, [], estimate, (slice(None), slice(None)), [], ranges)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
         """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.
@@ -134,7 +148,7 @@ class Pipeline:
         ``pair``: where the axis stands in pairs (x, y); cameras are (rows, columns).
         """
         plan = self.plan
-        reach = plan.problem.sampling.axis(axis).radius if plan.config.window.border == "full" else 0
+        reach = plan.reach(axis) if plan.config.window.border == "full" else 0
         shifts = [plan.preshift[pair] * (k - self.capture.reference[1 - pair]) for k in plan.cameras[1 - pair]]
         first, last = reach - min(shifts), size - 1 - reach - max(shifts)
         inside = [i for i, p in enumerate(positions) if first <= p <= last]
@@ -170,23 +184,30 @@ class Pipeline:
         engine.reset()
         engine.estimate.set_view(self._view((rows.start, cols.start), band, engine.tensor.out_pitch))
         corner = (plan.y[rows.start] - band.halo_y, plan.x[cols.start] - band.halo_x)
-        inside, kept = self._inside(band, corner)
         centre = _centres(band)
+        if engine.ranges:
+            band, corner = engine.ranges.outer, engine.ranges.move(engine.estimate.view, corner)
+        allowed = self._inside(band, corner)
         place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
         latency = engine.tensor.latency
-        finite: dict[int, NDArray[np.bool_]] = {}
+        samples: dict[int, Sample] = {}
         for t in range(plan.frames[first] - latency, plan.frames[last] + latency + 1):
             with self.timings.of("read"):
-                block, finite[t] = self._read(t, band, corner)
+                block, finite = self._read(t, band, corner)
             with self.timings.of("tensor"):
-                tensors = engine.push(block, inside & kept & finite[t])
+                if engine.ranges:
+                    samples[t] = engine.ranges.sample(t, block, allowed & finite, finite)
+                else:
+                    status = np.where(finite, np.uint8(Status.OK), np.uint8(Status.NOT_FINITE))
+                    samples[t] = Sample(block, allowed & finite, status)
+                tensors = engine.push(samples[t])
                 self.device.synchronize()
             frame = t - latency
-            finite.pop(frame - 1, None)
+            samples.pop(frame - 1, None)
             if tensors is None:
                 continue
             with self.timings.of("estimate"):
-                maps, status = self._maps(engine.estimate(*tensors), finite[frame][centre])
+                maps, status = self._maps(engine.estimate(*tensors), samples[frame], centre)
                 unit = plan.unit(first + frame - plan.frames[first], index)
                 result = self._frame_of(whole, maps, status, place)
             yield unit, *result
@@ -222,8 +243,8 @@ class Pipeline:
             return block, np.ones(block.shape[2:], bool)
         return np.where(finite, block, 0), finite.all(axis=(0, 1))
 
-    def _inside(self, band: Band, corner: tuple[int, int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Where every camera sees its image, and where the mask allows a measurement: [in_rows, in_cols]."""
+    def _inside(self, band: Band, corner: tuple[int, int]) -> NDArray[np.bool_]:
+        """Where every camera sees its image and the mask allows a measurement: [in_rows, in_cols]."""
         plan, capture = self.plan, self.capture
         y, x = corner[0] + np.arange(band.in_rows), corner[1] + np.arange(band.in_cols)
         in_y, in_x = np.ones(y.size, bool), np.ones(x.size, bool)
@@ -235,21 +256,26 @@ class Pipeline:
             in_x &= (shifted >= 0) & (shifted < capture.width)
         inside = in_y[:, None] & in_x
         if self._mask is None:
-            return inside, np.ones_like(inside)
+            return inside
         kept = self._mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
-        return inside, kept
+        return np.asarray(inside & kept)
 
-    def _maps(self, planes: NDArray[Any], finite: NDArray[np.bool_]) -> tuple[Maps, NDArray[np.uint8]]:
+    def _maps(
+        self, planes: NDArray[Any], sample: Sample, centre: tuple[slice, slice]
+    ) -> tuple[Maps, NDArray[np.uint8]]:
         """Named maps and the status of the measured rectangle."""
         from leafflow_ti.kernels.maps import Output
 
         status = planes[Output.STATUS].astype(np.uint8)
-        status[~finite] = Status.NOT_FINITE
+        reason = sample.status[centre]
+        status[reason != Status.OK] = reason[reason != Status.OK]
         maps = {}
         for name in self.plan.names:
             base = name.removesuffix("_std")
-            plane = _plane_of(base) + (Output.STD if name != base else 0)
-            maps[name] = planes[plane].astype(np.float32)
+            if name in sample.maps:
+                maps[name] = sample.maps[name][centre].astype(np.float32)
+            else:
+                maps[name] = planes[_plane_of(base) + (Output.STD if name != base else 0)].astype(np.float32)
         has_value = np.isin(status, HAS_VALUE)
         for values in maps.values():
             # A degenerate window can defeat the arithmetic: no NaN without a status that says so.

@@ -39,7 +39,7 @@ STACK = ("i", "z", "gx", "gy")
 """Images of one frame: intensity, range, derivatives of the intensity along x and y."""
 
 FINEST_RANGE = 1e-5
-"""Least noise of a given range, relative to its distance: what is finer weighs no more than this."""
+"""Least noise of the range, relative to its distance: what is finer weighs no more than this."""
 
 LEAST_NOISE = 1e-6
 """Least noise of the images, relative to their largest grey value."""
@@ -121,7 +121,7 @@ def factors(
     """
     seen = np.isfinite(depth) & np.isfinite(noise) & (depth > 0)
     ratio = working_mm / np.where(seen, depth, np.inf)
-    weight = image_noise / (beta * np.where(seen, noise, np.inf))
+    weight = image_noise / (beta * np.where(seen, np.maximum(noise, FINEST_RANGE * depth), np.inf))
     return np.stack([weight * ratio, weight * (working_mm / f_px), weight, ratio])
 
 
@@ -130,16 +130,16 @@ def smoothed_samples(x: AxisSampling, y: AxisSampling) -> float:
     return float(1.0 / np.prod([np.sum(np.array(axis.weights) ** 2) for axis in (x, y)]))
 
 
-def white_noise(image: NDArray[Any]) -> float:
+def white_noise(image: NDArray[Any], rounded: bool) -> float:
     """Standard deviation of the white noise of an image [y, x]: fourth differences along both axes, a robust median.
 
-    What is smoother than some five pixels does not count; flat parts, whose rounding hides the noise, neither. Integer
-    images have at least the noise of rounding, others ``LEAST_NOISE`` of their largest value.
+    What is smoother than some five pixels does not count; flat parts, whose rounding hides the noise, neither. Images
+    ``rounded`` to integers have at least the noise of that, others ``LEAST_NOISE`` of their largest value.
     """
     values = np.asarray(image, np.float64)
     finite = np.isfinite(values)
     largest = float(np.max(np.abs(values[finite]), initial=0.0))
-    least = 12**-0.5 if np.asarray(image).dtype.kind in "bui" else LEAST_NOISE * largest
+    least = 12**-0.5 if rounded else LEAST_NOISE * largest
     difference = np.abs(np.diff(np.diff(values, 4, axis=0), 4, axis=1))
     difference = difference[np.isfinite(difference) & (difference > 0)]
     if not difference.size:
