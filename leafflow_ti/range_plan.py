@@ -93,17 +93,16 @@ def range_problem(
     geometry = capture.geometry
     if geometry is None:
         raise ConfigError("model 'range-flow' needs the focal length: add [camera] focal_length_px to the capture.toml")
-    middle = frames[len(frames) // 2]
-    image = capture.read(middle, *capture.reference, 0, capture.height, 0, capture.width, np.float64)
+    image = capture.read(capture.n_frames // 2, *capture.reference, 0, capture.height, 0, capture.width, np.float64)
     noise = white_noise(image, capture.dtype.kind in "bui")
     given = None
     if depth is None:
         assert chosen.depth is not None
         radius = sampling.t.radius
         given = open_range(chosen.depth, capture, range(frames[0] - radius, frames[-1] + radius + 1))
-        seen = given.frame(middle)[0]
+        seen = given.frame(given.middle)[0]
         if not np.isfinite(seen).any():
-            raise InputError(f"{given.path}: no depth in frame {middle}: leave it out with --frames")
+            raise InputError(f"{given.path}: no depth at all in frame {given.middle}: give maps that have some")
         working = float(np.nanmedian(seen))
     else:
         along = 0 if depth.camera_axes[0] == "sx" else 1

@@ -39,6 +39,11 @@ class GivenRange(ABC):
         """Depth and the standard error that it is shown with [mm], [height, width]; NaN where there is none."""
 
     @property
+    @abstractmethod
+    def middle(self) -> int:
+        """The frame that stands for all: results must not depend on which of them are asked for."""
+
+    @property
     def smoothing(self) -> float:
         """White samples behind each value of the range."""
         return 1.0
@@ -79,6 +84,11 @@ class RangeFiles(GivenRange):
         depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
         return depth, np.where(np.isfinite(depth), self.noise, np.nan)
 
+    @property
+    def middle(self) -> int:
+        """See ``GivenRange``."""
+        return len(self.files) // 2
+
     def fingerprint(self) -> dict[str, Any]:
         """Names and sizes of the files, and the checksum of the first."""
         listing = "".join(f"{file.name}\0{file.stat().st_size}\n" for file in self.files)
@@ -98,6 +108,11 @@ class RangeStore(GivenRange):
 
     def __post_init__(self) -> None:
         self._read = lru_cache(maxsize=2)(self._whole)
+
+    @property
+    def middle(self) -> int:
+        """See ``GivenRange``."""
+        return self.store.frames[len(self.store.frames) // 2]
 
     @property
     def smoothing(self) -> float:
@@ -155,9 +170,11 @@ def open_range(path: str, capture: Capture, frames: range) -> GivenRange:
         files = [found[0][1]] * capture.n_frames
         stack = _open_stack(files[0], capture.n_frames)
     given = RangeFiles(path, files, stack, shape)
-    depth, _ = given.frame((frames.start + frames.stop - 1) // 2)
+    depth, _ = given.frame(given.middle)
     if not np.isfinite(depth).any():
-        raise InputError(f"{path}: the range map has no finite, positive value: depths in mm are needed")
+        raise InputError(
+            f"{path}: the range map of frame {given.middle} has no finite, positive value: depths in mm are needed"
+        )
     given.noise = max(white_noise(depth, False), FINEST_RANGE * float(np.nanmedian(depth)))
     return given
 

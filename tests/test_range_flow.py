@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from reference import range_flow as twin
 from test_kernels_tensor import relative_error
+from test_pipeline import assert_same, files_of
 from tolerances import tolerance
 
+import leafflow_ti as lf
 from leafflow_ti import range_flow
+from leafflow_ti.capture import Capture, Geometry, capture_from_array
+from leafflow_ti.config import RunConfig, load_config
+from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import filter_set
 from leafflow_ti.models import TensorLayout
+from leafflow_ti.progress import Progress
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import DENOISE, EstimateStage, Problem, View
@@ -127,3 +136,199 @@ def test_equals_the_twin(device: Callable[[str], Device], precision: str, constr
 @pytest.mark.parametrize(("constraint", "estimator"), list(product(("taylor", "intgrad"), ("ols", "tls"))))
 def test_other_estimators(device: Callable[[str], Device], constraint: str, estimator: str) -> None:
     check(device("f64"), constraint, "none", estimator)
+
+
+SMALL = PlaneScene(
+    f_px=900.0,
+    baseline_mm=(0.3, 0.3),
+    n_cols=5,
+    n_frames=11,
+    size=(83, 63),
+    centre=(0.3, -0.2, 80.0),
+    zx=0.3,
+    zy=-0.2,
+    velocity=(0.021, -0.014, 0.06),
+    wavelengths_mm=(0.9, 1.1),
+    alpha=0.4,
+    beta=1.0,
+    noise=2.0,
+)
+OPTIONS: dict[str, object] = {
+    "model": "range-flow", "preshift": (-3, 0), "window": 13, "sigma": 4.0, "size_time": 3, "taps_time": "5",
+}  # fmt: skip
+
+
+@functools.cache
+def capture(cameras: int = 5, light: bool = False) -> Capture:
+    scene = replace(SMALL, n_cols=cameras, brightness=LIGHT if light else ())
+    return capture_from_array(render(scene), Geometry(scene.f_px, scene.principal, (scene.baseline_mm[0], 0.0)))
+
+
+@pytest.fixture
+def stack(tmp_path: Path) -> str:
+    """Range maps with white noise of .02 mm and a hole, as one .npy file."""
+    depth = exact_depth(SMALL)
+    depth += np.random.default_rng(1).normal(0, 0.02, depth.shape)
+    depth[:, 30:33, 40:43] = np.nan
+    np.save(tmp_path / "depth.npy", depth)
+    return str(tmp_path / "depth.npy")
+
+
+def config(**options: object) -> RunConfig:
+    return load_config(overrides={**OPTIONS, **options})
+
+
+@pytest.mark.parametrize("constraint", range_flow.CONSTRAINTS)
+@pytest.mark.parametrize("given", [False, True], ids=["own", "given"])
+def test_velocity_of_a_plane(stack: str, constraint: str, given: bool) -> None:
+    """Errors of a few standard errors, and small ones: the light changes where the constraint allows for it."""
+    cameras, depth = (1, stack) if given else (5, None)
+    light = constraint == "taylor"
+    field = lf.estimate(capture(cameras, light), 5, **OPTIONS, constraint=constraint, depth=depth, stride=4)
+    ok = field.status == Status.OK
+    assert ok.sum() > (100 if given else 30)
+    for i, axis in enumerate("xyz"):
+        error = field[f"velocity_{axis}"][ok] - SMALL.velocity[i]
+        largest = {"x": 1e-3, "y": 1e-3, "z": 1e-3 if given else 0.035}
+        assert np.sqrt(np.mean(error**2)) < largest[axis], axis
+        pulls = error / field[f"velocity_{axis}_std"][ok]
+        assert 0.6 < np.sqrt(np.mean(pulls**2)) < 1.7, axis
+    wanted = exact_depth(SMALL)[5][np.ix_(field.y, field.x)]
+    np.testing.assert_allclose(field["depth"][ok], wanted[ok], atol=0.1 if given else 0.4)
+    if given:
+        assert np.median(field["depth_std"][ok]) == pytest.approx(0.02, rel=0.1)
+    if given:
+        hole = np.ix_((field.y >= 30) & (field.y < 33), (field.x >= 40) & (field.x < 43))
+        assert (field.status[hole] == Status.NOT_FINITE).all()
+        assert hole[0].size
+        assert hole[1].size
+    if light:
+        x, y = np.meshgrid(field.x - SMALL.principal[0], field.y - SMALL.principal[1])
+        place = [np.array(c) * wanted / SMALL.f_px - m for c, m in zip((x, y), SMALL.centre[:2], strict=True)]
+        rate = LIGHT[0].g + LIGHT[0].gx * place[0] + LIGHT[0].gy * place[1]
+        np.testing.assert_allclose(field["brightness_t"][ok], rate[ok], atol=6e-3)
+
+
+def test_every_source_of_range_is_the_same(stack: str, tmp_path: Path) -> None:
+    """A stack, a file per frame, and a results store of our own depth; a store gives what own depth gives."""
+    maps = np.load(stack)
+    for t, image in enumerate(maps):
+        np.save(tmp_path / f"z_{t:02d}.npy", image)
+        tifffile.imwrite(tmp_path / f"z_{t:02d}.tif", image)
+    tifffile.imwrite(tmp_path / "stack.tif", maps, photometric="minisblack")
+    whole = lf.estimate(capture(1), 5, **OPTIONS, depth=stack, stride=6)
+    for name in ("z_{t:02d}.npy", "z_{t:02d}.tif", "stack.tif"):
+        assert_same(whole, lf.estimate(capture(1), 5, **OPTIONS, depth=str(tmp_path / name), stride=6))
+    static = {k: v for k, v in OPTIONS.items() if k in ("preshift", "window", "sigma")}
+    lf.run(capture(), tmp_path / "depth.zarr", load_config(overrides={"model": "depth", **static}))
+    own = lf.estimate(capture(), 5, **OPTIONS)
+    stored = lf.estimate(capture(), 5, **OPTIONS, depth=str(tmp_path / "depth.zarr"))
+    ok = own.status == Status.OK
+    assert ok.sum() > 300
+    assert (stored.status[ok] == Status.OK).all()
+    for name in ("velocity_x", "velocity_y", "velocity_z"):
+        # The working distances differ, and with them the share of the range's noise.
+        assert np.max(np.abs(own[name][ok] - stored[name][ok]) / own[f"{name}_std"][ok]) < 0.05
+
+
+@pytest.mark.parametrize("constraint", ["taylor", "grad"])
+@pytest.mark.parametrize("given", [False, True], ids=["own", "given"])
+def test_tiled_equals_whole(stack: str, constraint: str, given: bool) -> None:
+    depth = stack if given else None
+    options = {**OPTIONS, "constraint": constraint, "depth": depth, "stride": 2}
+    whole, tiled = (lf.estimate(capture(), 5, **options, tile=tile) for tile in (40, 7))
+    assert_same(whole, tiled)
+
+
+def test_resumed_run_and_single_frames_are_the_same(tmp_path: Path) -> None:
+    """Sliding through the sequence, interrupted and resumed, equals one run and equals single frames."""
+    wanted = config(tile=16, stride=2)
+
+    def die(progress: Progress) -> None:
+        if progress.done_units == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        lf.run(capture(), tmp_path / "out.zarr", wanted, progress=die)
+    lf.run(capture(), tmp_path / "out.zarr", wanted, resume=True)
+    lf.run(capture(), tmp_path / "whole.zarr", wanted)
+    assert files_of(tmp_path / "out.zarr") == files_of(tmp_path / "whole.zarr")
+    store = lf.ResultStore.open(tmp_path / "out.zarr")
+    assert len(store.frames) > 2
+    for index, frame in enumerate(store.frames[:2]):
+        assert_same(store.field(index), lf.estimate(capture(), frame, **OPTIONS, tile=16, stride=2))
+
+
+def test_measurable_region_shrinks_by_the_second_window() -> None:
+    """Window and filters of depth, of range flow, and the preshift of the outer cameras."""
+    plan = lf.plan_run(capture(), config())
+    reach = 2 * (6 + 2)
+    assert plan.reach("x") == plan.reach("y") == reach
+    field = lf.estimate(capture(), 5, **OPTIONS)
+    inside = np.argwhere(field.status != Status.BORDER)
+    assert inside[:, 0].min() == reach
+    assert inside[:, 1].min() == reach + 2 * 3
+    assert "window of 13 px before that of range flow" in plan.describe()
+
+
+def test_weight_of_the_intensity(stack: str) -> None:
+    """β shifts the balance: a large one leaves little of the range, which alone tells W well here."""
+    errors = [
+        lf.estimate(capture(1), 5, **OPTIONS, depth=stack, stride=6, beta=beta)["velocity_z_std"]
+        for beta in (1.0, 1000.0)
+    ]
+    assert np.nanmedian(errors[1]) > 5 * np.nanmedian(errors[0])
+
+
+def test_noise_of_images() -> None:
+    random = np.random.default_rng(2)
+    y, x = np.mgrid[:80, :90]
+    smooth = 100 + 40 * np.cos(0.3 * x) * np.sin(0.25 * y)
+    assert range_flow.white_noise(smooth + random.normal(0, 1.5, x.shape), False) == pytest.approx(1.5, rel=0.1)
+    assert range_flow.white_noise(np.round(smooth), True) == pytest.approx(12**-0.5, rel=0.2)
+    flat = np.full(x.shape, 20.0)
+    flat[:, :40] += random.normal(0, 1.5, (80, 40))
+    assert range_flow.white_noise(flat, False) == pytest.approx(1.5, rel=0.2)
+    assert range_flow.white_noise(np.full((20, 20), 7.0), True) == pytest.approx(12**-0.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"motion": "rotation"}, "motion 'rotation': model 'range-flow' does not have it"),
+        ({"rows": "2d"}, "rows '2d': model 'range-flow' has no rows"),
+        ({"constraint": "int", "brightness_terms": "space"}, "constraint 'int' takes the brightness for constant"),
+        ({"depth": "none_{t}.npy"}, "no such range maps"),
+        ({"depth": "z_{sx}.npy"}, "a range map has the field {t} alone"),
+        ({"brightness": "temporal"}, "brightness 'temporal' needs a sequence in time"),
+    ],
+)
+def test_choices_that_do_not_fit(options: dict[str, object], message: str) -> None:
+    with pytest.raises((ConfigError, InputError), match=re.escape(message)):
+        lf.plan_run(capture(), config(**options))
+
+
+def test_range_maps_that_do_not_fit(tmp_path: Path, stack: str) -> None:
+    maps = np.load(stack)
+    cases = {
+        "short.npy": (maps[:5], "is no stack [t, y, x] of the capture's 11 frames"),
+        "small.npy": (maps[:, :20], "a range map of 83 x 20 pixels for images of 83 x 63"),
+        "empty.npy": (np.full_like(maps, np.nan), "no finite, positive value"),
+        "text.npy": (np.full(maps.shape, "a"), "of type <U1: give depths in mm as floats"),
+    }
+    for name, (values, message) in cases.items():
+        np.save(tmp_path / name, values)
+        with pytest.raises(InputError, match=re.escape(message)):
+            lf.plan_run(capture(1), config(depth=str(tmp_path / name)))
+    for t in range(10):
+        np.save(tmp_path / f"z_{t}.npy", maps[t])
+    with pytest.raises(InputError, match="1 of 11 range maps are missing, first t = 10"):
+        lf.plan_run(capture(1), config(depth=str(tmp_path / "z_{t}.npy")))
+    with pytest.raises(
+        ConfigError, match="needs a camera grid or range maps, the capture has one camera: give --depth"
+    ):
+        lf.plan_run(capture(1), config())
+    static = {k: v for k, v in OPTIONS.items() if k in ("preshift", "window", "sigma")}
+    lf.run(capture(), tmp_path / "thin.zarr", load_config(overrides={"model": "depth", "stride": 20, **static}))
+    with pytest.raises(InputError, match="range flow needs depth at every pixel: run with --stride 1"):
+        lf.plan_run(capture(), config(depth=str(tmp_path / "thin.zarr")))

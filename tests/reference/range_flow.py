@@ -73,7 +73,7 @@ def structure_tensor(images, depth, noise, image_noise, beta, constraint, terms,
             if name in ("tt", "xx", "yy"):
                 value = value - moment(name[0]) * d["i"][window]
             row.append(value)
-        vectors.append([v / norm for v in (*row, d["t"][window])])
+        vectors.append([v / norm / np.sqrt(len(kinds)) for v in (*row, d["t"][window])])
     J = 0.0
     for vector in vectors:
         d = np.array([v.ravel() for v in vector])
