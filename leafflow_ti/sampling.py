@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from itertools import product
 
@@ -155,6 +156,7 @@ class NoiseTerm:
     value: float
 
 
+@functools.lru_cache(maxsize=64)
 def noise_ratio(sampling: Sampling, columns: ColumnSet, solution: str) -> tuple[Array, tuple[NoiseTerm, ...]]:
     """``Cov(Σ w f n) = σ² ρ (J_ff ∘ K + terms)`` for the solution along ``solution``: K [n_flow, n_flow] and terms.
 
@@ -193,6 +195,7 @@ def noise_ratio(sampling: Sampling, columns: ColumnSet, solution: str) -> tuple[
                     found[pair] = found.get(pair, 0.0) + sign * u * v * r * s * float(K[p, q])
             found.pop((a, b))
             terms += [NoiseTerm(a, b, *pair, value) for pair, value in found.items()]
+    K.flags.writeable = False  # shared by all who ask
     return K, tuple(terms)
 
 

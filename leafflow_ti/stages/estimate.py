@@ -202,8 +202,7 @@ class EstimateStage:
             # The same rows among all unknowns.
             self._final = _Tables(self.reference.number.copy(), self.reference.value)
             self._set_numbers(self._final.number, UNKNOWNS=own.unknowns, CORRELATED=columns.n_flow)
-            own_layout = TensorLayout.of(own.columns)
-            self._own = [self._own_tables(own, own_layout, step) for step in own.steps]
+            self._own = self._own_tables(own)
             self._all_tables += [self._final, *self._own]
         self.set_view(view)
         lanes = device.dense.lanes
@@ -318,24 +317,30 @@ class EstimateStage:
                 value[Value.CROSS + k * 9 + j] = term.value
         return tables
 
-    def _own_tables(self, own: OwnFlows, layout: TensorLayout, step: tuple[int, int]) -> _Tables:
-        """Tables of one camera's own flow; ``step``: where it stands."""
+    def _own_tables(self, own: OwnFlows) -> list[_Tables]:
+        """Tables of each camera's own flow: they differ by where the camera stands."""
         from leafflow_ti.kernels.workspace import Number, Value
 
-        found = [own.columns.index(c, o) for c in ("x", "y") for o in own.offsets]
-        tables = self._tables(own.columns, own.sampling, layout, own.offsets, [i for i in found if i is not None])
-        number, value = tables.number, tables.value
         columns = self.problem.columns
-        self._set_numbers(number, OWN_FLOW=1, UNKNOWNS=own.unknowns, CORRELATED=columns.n_flow * own.reference_rows)
+        rows = [own.columns.index(c, o) for c in ("x", "y") for o in own.offsets]
+        common = self._tables(
+            own.columns, own.sampling, TensorLayout.of(own.columns), own.offsets, [i for i in rows if i is not None]
+        )
+        correlated = columns.n_flow if own.reference_rows else 0
+        self._set_numbers(common.number, OWN_FLOW=1, UNKNOWNS=own.unknowns, CORRELATED=correlated)
         moves = [own.columns.index(c, o) for c in ("x", "y") for o in ("x", "y")]
-        number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
-        value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
-        for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
-            number[Number.PARTNER + a] = partner
-            if partner >= 0:
-                scales = self.reference.value[Value.SCALE + a], value[Value.SCALE + partner]
-                value[Value.PARTNER + a] = factor * scales[0] / scales[1]
-        return tables
+        common.number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
+        found = []
+        for step in own.steps:
+            number, value = common.number.copy(), common.value.copy()
+            value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
+            for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
+                number[Number.PARTNER + a] = partner
+                if partner >= 0:
+                    scales = self.reference.value[Value.SCALE + a], value[Value.SCALE + partner]
+                    value[Value.PARTNER + a] = factor * scales[0] / scales[1]
+            found.append(_Tables(number, value))
+        return found
 
     def set_view(self, view: View) -> None:
         """Move to another band of the same size."""
