@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.range_flow import factors, images
+from leafflow_ti.range_flow import factors, images, window_radius
 from leafflow_ti.range_plan import RangePlan
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
@@ -39,7 +39,7 @@ class RangeEngine:
     """Makes the samples of range flow for bands of one size; ``outer`` is the block of images that it needs."""
 
     def __init__(self, device: Device, plan: RangePlan, sampling: Sampling, f_px: float, band: Band):
-        self.plan, self.band, self.f_px = plan, band, f_px
+        self.plan, self.band, self._radius = plan, band, window_radius(sampling)
         rows, cols = band.in_rows, band.in_cols
         self.gradients = GradientStage(device, sampling, rows, cols) if plan.gradients else None
         radius = self.gradients.radius if self.gradients else 0
@@ -94,13 +94,9 @@ class RangeEngine:
             valid &= eroded(seen[around], r, r)
         assert len(stack) == len(images(self.plan.constraint))
         planes = factors(
-            depth,
-            noise * self.plan.samples**0.5,
-            self.plan.working_mm,
-            self.f_px,
-            self.plan.image_noise,
+            depth, noise * self.plan.samples**0.5, self.plan.working_mm, self._radius, self.plan.image_noise,
             self.plan.beta,
-        )
+        )  # fmt: skip
         return Sample(np.array(stack)[None], valid, status.astype(np.uint8), planes, maps)
 
     def _range(self, t: int, block: Array, seen: NDArray[np.bool_]) -> tuple[dict[str, Array], Array]:

@@ -7,8 +7,9 @@ A surface point with the velocity (U, V, W) [mm/frame] obeys, at the image posit
 
 and the second also with a derivative of the image along x or y in the place of I. With the window's centre (x0, y0) and
 ``U' = U - x0/f W``, ``V' = V - y0/f W`` the offsets (Δx, Δy) take the place of (x, y): both are data vectors of the
-columns (U', V', W), whose tensors add up. The unknowns are counted in px/frame at a working distance Zr, ``f/Zr`` times
-the velocity, so that they, their columns and all thresholds are those of optical flow.
+columns (U', V', W), whose tensors add up. The unknowns are counted in px/frame, as displacements in the image at a
+working distance Zr: ``f/Zr`` times U' and V', and ``r/Zr`` times W, its displacement at the distance r from the window's
+centre, the root of the window's second moment. Columns and thresholds are then those of optical flow.
 
 Weights. Every constraint is scaled to the noise of the intensity: with noise σ_I of the images and σ_Z of the range
 [mm], the range constraint gets the factor ``σ_I / (β σ_Z)``, that of a derivative of the image 1 over the norm of its
@@ -57,9 +58,7 @@ def gradient_kernel(sampling: Sampling, axis: str) -> NDArray[np.float64]:
     return np.outer(sampling.y.kernel(axis == "y"), sampling.x.kernel(axis == "x"))
 
 
-def columns(
-    constraint: str, sampling: Sampling, f_px: float, brightness_terms: str = "none", range_noise: float = 1.0
-) -> ColumnSet:
+def columns(constraint: str, sampling: Sampling, brightness_terms: str = "none", range_noise: float = 1.0) -> ColumnSet:
     """Columns (U', V', W), brightness where the constraint has it, and the derivatives in time.
 
     ``range_noise``: noise variance of a sample of the scaled range relative to that of the intensity.
@@ -83,7 +82,7 @@ def columns(
         own = 0 if image == "z" else 3
         x, y, t = (channel(image, a, o, noise) for a, o in (("x", own), ("y", own), ("t", 2 if own == 0 else None)))
         depth = [Term(channel("z", "1", 1, 0.0), ONE, -1.0, number)] if image == "z" else []
-        across = [Term(c, monomial(a), -norm / f_px, number) for c, a in ((x, "x"), (y, "y"))]
+        across = [Term(c, monomial(a), -norm / window_radius(sampling), number) for c, a in ((x, "x"), (y, "y"))]
         return [
             [Term(x, ONE, norm, number)],
             [Term(y, ONE, norm, number)],
@@ -104,6 +103,11 @@ def columns(
     return ColumnSet((*map(Column, merged[:3]), *light, Column(merged[3])), 1, derived)
 
 
+def window_radius(sampling: Sampling) -> float:
+    """Distance r from the window's centre [px] at which W is counted."""
+    return float(np.sqrt(0.5 * (sampling.x.moment(2) + sampling.y.moment(2))))
+
+
 def _gain(sampling: Sampling, axis: str, prefilter: str | None) -> float:
     """Noise gain of a channel, of a derivative image relative to that image's own noise."""
     if prefilter is None:
@@ -115,16 +119,17 @@ def _gain(sampling: Sampling, axis: str, prefilter: str | None) -> float:
 
 
 def factors(
-    depth: NDArray[Any], noise: NDArray[Any], working_mm: float, f_px: float, image_noise: float, beta: float
+    depth: NDArray[Any], noise: NDArray[Any], working_mm: float, radius_px: float, image_noise: float, beta: float
 ) -> NDArray[Any]:
     """Planes [4, y, x] for the channels: of Zx and Zy, of the constant, of Zt, of Ix and Iy; 0 without range.
 
-    ``depth`` and its white ``noise`` [mm] (see the module's docstring), NaN where there is none.
+    ``depth`` and its white ``noise`` [mm] (see the module's docstring), NaN where there is none; ``radius_px``: that of
+    ``window_radius``.
     """
     seen = np.isfinite(depth) & np.isfinite(noise) & (depth > 0)
     ratio = working_mm / np.where(seen, depth, np.inf)
     weight = image_noise / (beta * np.where(seen, np.maximum(noise, FINEST_RANGE * depth), np.inf))
-    return np.stack([weight * ratio, weight * (working_mm / f_px), weight, ratio])
+    return np.stack([weight * ratio, weight * (working_mm / radius_px), weight, ratio])
 
 
 def smoothed_samples(x: AxisSampling, y: AxisSampling) -> float:

@@ -10,7 +10,7 @@ from leafflow_ti.capture import Capture
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.models import TensorLayout
-from leafflow_ti.range_flow import columns, images, smoothed_samples, white_noise
+from leafflow_ti.range_flow import columns, images, smoothed_samples, white_noise, window_radius
 from leafflow_ti.range_source import GivenRange, open_range
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.estimate import Problem
@@ -112,8 +112,7 @@ def range_problem(
     plan = RangePlan(chosen.constraint, chosen.beta, working, noise, given, depth, layout)
     # A range that was smoothed over windows has next to no noise of its own from pixel to pixel.
     share = 1 / (chosen.beta**2 * plan.samples)
-    problem = Problem(
-        columns(chosen.constraint, sampling, geometry.f_px, model.brightness_terms, share), sampling,
-        model.estimator, model.solver, fitted=3, range_scale=working / geometry.f_px,
-    )  # fmt: skip
+    scale = (working / geometry.f_px, working / window_radius(sampling))
+    found = columns(chosen.constraint, sampling, model.brightness_terms, share)
+    problem = Problem(found, sampling, model.estimator, model.solver, fitted=3, range_scale=scale)
     return problem, plan

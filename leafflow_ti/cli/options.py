@@ -20,7 +20,8 @@ Model = Annotated[
     str | None,
     _text(
         "model",
-        "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d",
+        "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d|"
+        "scene-flow|affine-scene-flow|range-flow",
         "What is estimated [auto: affine-4d for a line of cameras, affine-5d for a 2D grid, depth without time, "
         "flow-affine for one camera].",
     ),

@@ -11,7 +11,7 @@ from leafflow_ti.kernels.workspace import Number, Region, Value, batch_kernel
 
 @functools.cache
 def range_motion_kernel(spec: KernelSpec):
-    """The stage that turns (U', V', W), in px/frame at the working distance, into (U, V, W) and their covariance."""
+    """The stage that turns (U', V', W), in px/frame, into (U, V, W) and their covariance."""
     precise, lanes = spec.precise, spec.lanes
     patch = patch_functions(spec)
 
@@ -20,7 +20,7 @@ def range_motion_kernel(spec: KernelSpec):
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """``U = U' + x0/f W``, ``V = V' + y0/f W``, times the scale."""
+        """``U = U' + x0/f W``, ``V = V' + y0/f W``, from px to mm."""
         parameters = base + (number[Region.PARAMETERS] + number[Number.MOTION_SOLUTION] * number[Number.FLOW]) * stride
         rows = base + number[Region.COV_T] * stride
         motion = base + number[Region.MOTION] * stride
@@ -28,8 +28,8 @@ def range_motion_kernel(spec: KernelSpec):
         for i in range(lanes):
             ray = patch.pixel_ray(pixel + i, number, value)
             turn = ti.Matrix.identity(precise, 3) * value[Value.MOTION_SCALE]
-            turn[0, 2] = ray[0] * value[Value.MOTION_SCALE]
-            turn[1, 2] = ray[1] * value[Value.MOTION_SCALE]
+            depth = value[Value.MOTION_SCALE + 1]
+            turn[0, 2], turn[1, 2], turn[2, 2] = ray[0] * depth, ray[1] * depth, depth
             q = ti.Vector.zero(precise, 3)
             cov = ti.Matrix.zero(precise, 3, 3)
             for r in ti.static(range(3)):

@@ -218,8 +218,8 @@ class Value(IntEnum):
     ROUGHEST = auto()  # share of the gradient's energy that one more smoothing leaves, below which it is noise
     MAX_RESIDUAL = auto()  # px, for status incoherent
     MAX_SHIFT = auto()  # px per step or frame, likewise
-    MOTION_SCALE = auto()  # mm per px of range flow's unknowns
-    GAP = auto()  # convergence: residual per gap
+    MOTION_SCALE = auto()  # 2: mm per px of range flow's U', V', and of W
+    GAP = MOTION_SCALE + 2  # convergence: residual per gap
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9

@@ -72,8 +72,8 @@ class Problem:
     """What is estimated: columns, geometry terms, motion rows; independent of band and device.
 
     ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``fitted``: unknowns of the motion fit to the
-    reference's rows (0: none), from which a fit with ``own_flows`` starts. ``range_scale``: of range flow, mm per px at
-    its working distance.
+    reference's rows (0: none), from which a fit with ``own_flows`` starts. ``range_scale``: of range flow, mm per px of
+    (U', V') and of W.
     """
 
     columns: ColumnSet
@@ -87,7 +87,7 @@ class Problem:
     own_flows: OwnFlows | None = None
     passes: int = 3
     iterations: int = 4
-    range_scale: float | None = None
+    range_scale: tuple[float, float] | None = None
 
     @property
     def unknowns(self) -> int:
@@ -302,7 +302,7 @@ class EstimateStage:
             WORLD_MAPS=len(problem.world_brightness), CAMERA_SOLUTIONS=len(problem.camera_axes),
             RANGE_TERM=problem.terms.index("t") if "t" in problem.terms else -1,
         )  # fmt: skip
-        value[Value.MOTION_SCALE] = problem.range_scale or 0.0
+        value[Value.MOTION_SCALE : Value.MOTION_SCALE + 2] = problem.range_scale or (0.0, 0.0)
         planes = [Output[BRIGHTNESS_MAPS[o].upper()] - Output.BRIGHTNESS_T for o in problem.brightness]
         number[Number.BRIGHTNESS_PLANES : Number.BRIGHTNESS_PLANES + len(planes)] = planes
         for k, axis in enumerate(problem.camera_axes):

@@ -31,8 +31,15 @@ def gradients(images, sampling: Sampling):
     return found
 
 
+def radius(sampling: Sampling):
+    """Root of the second moment of the window along an axis."""
+    weights = np.array(sampling.x.weights)
+    return np.sqrt(np.sum(weights * (np.arange(weights.size) - weights.size // 2) ** 2.0))
+
+
 def structure_tensor(images, depth, noise, image_noise, beta, constraint, terms, sampling, f, working, pixel):
-    """J [n, n] of the columns (U', V', W, brightness, time) in px/frame at the working distance, at ``pixel`` (x, y).
+    """J [n, n] of the columns (U', V', W, brightness, time) in px/frame at ``pixel`` (x, y): U' and V' as they are seen
+    at the working distance, W as it is seen there at the radius of the window.
 
     ``images``, ``depth``, ``noise``: [t, y, x]; samples without range (NaN) have no weight.
     """
@@ -45,12 +52,12 @@ def structure_tensor(images, depth, noise, image_noise, beta, constraint, terms,
     weight = weight * chain.filters_see(np.isfinite(depth), sampling)[window]
     filled = np.nan_to_num(depth, nan=1.0)
     Z, sigma = filled[window], np.nan_to_num(noise, nan=1.0)[window]
-    s = working / f  # mm per px at the working distance
+    s, w = working / f, working / radius(sampling)  # mm per px
 
     def motion(d):
-        """``(f Gx/Z, f Gy/Z, -(x Gx + y Gy)/Z)`` times s, x and y from the centre."""
+        """``(f Gx/Z, f Gy/Z, -(x Gx + y Gy)/Z)`` in mm, x and y from the centre, times mm per px."""
         gx, gy = d["x"][window], d["y"][window]
-        return [s * f * gx / Z, s * f * gy / Z, -s * (offset["x"] * gx + offset["y"] * gy) / Z]
+        return [s * f * gx / Z, s * f * gy / Z, -w * (offset["x"] * gx + offset["y"] * gy) / Z]
 
     def moment(a):
         return np.sum(np.array(sampling.axis(a).weights) * np.arange(-half[a], half[a] + 1.0) ** 2)
@@ -60,7 +67,7 @@ def structure_tensor(images, depth, noise, image_noise, beta, constraint, terms,
     Zd = derivatives(filled, sampling)
     U, V, W = motion(Zd)
     scale = image_noise / (beta * sigma)
-    vectors.append([scale * v for v in (U, V, W - s, *[0 * U] * len(light), Zd["t"][window])])
+    vectors.append([scale * v for v in (U, V, W - w, *[0 * U] * len(light), Zd["t"][window])])
     kinds = [(images, 1.0)] if constraint != "grad" else []
     kinds += gradients(images, sampling) if "grad" in constraint else []
     for image, norm in kinds:
@@ -86,5 +93,7 @@ def velocity(J, rho, columns, sampling, estimator, denoise, f, working, x0, y0):
     P, variance = chain.solve(J, columns, sampling, estimator)
     cov = chain.covariances(J, variance, columns, sampling, rho, denoise)
     P, cov = chain.at_centre(P, cov, columns)
-    T = working / f * np.array([[1, 0, x0 / f], [0, 1, y0 / f], [0, 0, 1]])
+    T = np.array([[1, 0, x0 / f], [0, 1, y0 / f], [0, 0, 1]]) @ np.diag(
+        [working / f, working / f, working / radius(sampling)]
+    )
     return T @ P[:3, 0], T @ cov[0, 0][:3, :3] @ T.T, -P[3:, 0], cov[0, 0][3:, 3:]
