@@ -19,6 +19,7 @@ from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set
 from leafflow_ti.range_plan import RangePlan, range_problem
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
+from leafflow_ti.stages.prefilter import prefilter_bytes
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -101,7 +102,14 @@ class Plan:
             names += [f"brightness_{a}" for a in problem.camera_axes]
         names += [BRIGHTNESS_MAPS[o] for o in problem.brightness]
         names += [WORLD_MAPS[o] for o in problem.world_brightness]
+        if "depth" in names and problem.unknowns >= 3:
+            names.append("growth_rate")
         return tuple(names)
+
+    @property
+    def margin(self) -> int:
+        """Output pixels around a band, and around the region, that are computed for the sake of those inside."""
+        return int(any(name.startswith("growth") for name in self.names))
 
     def band(self, index: int) -> slice:
         """Output rows of one band."""
@@ -147,6 +155,9 @@ class Plan:
             lines.append(f"motion      {problem.unknowns} unknowns from {' and '.join(taken)}")
         pixels = len(self.frames) * len(self.y) * len(self.x)
         limit = self.config.plan.max_memory
+        filters = self.config.filters
+        if filters.prefilter != "none":
+            lines.append(f"prefilter   {filters.prefilter}, sigma {filters.sigma_pre:g} px")
         lines += [
             f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
             f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
@@ -170,6 +181,11 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     model = MODELS[name]
     if not (model.ranges and config.range_flow.depth):
         _check_model(name, capture)
+    if config.filters.prefilter == "highpass" and config.model.brightness != "none":
+        raise ConfigError(
+            f"brightness '{config.model.brightness}' is relative to the grey value, which prefilter 'highpass' takes "
+            "away: choose prefilter homomorphic, or brightness none"
+        )
     motion = _motion(config, name)
     preshift, ranges = (0, 0), None
     if model.ranges:
@@ -190,11 +206,13 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
             f"output.roi = {x0},{y0},{x1},{y1} reaches beyond the images of {size} pixels: make it smaller"
         )
     x, y = range(x0, x1, config.window.stride), range(y0, y1, config.window.stride)
-    band_rows, memory = _band_rows(config, problem, layout, ranges, len(y), len(x))
     grid = (ranges.depth if ranges and ranges.depth else problem).sampling
+    cameras = _cameras(grid, problem.own_flows, *capture.reference)
+    n_cameras = len(cameras[0]) * len(cameras[1])
+    band_rows, memory = _band_rows(config, problem, layout, ranges, n_cameras, len(y), len(x))
     return Plan(
         config, name, problem, layout, _geometry(capture),
-        _cameras(grid, problem.own_flows, *capture.reference), preshift, frames, y, x, band_rows, memory, ranges,
+        cameras, preshift, frames, y, x, band_rows, memory, ranges,
     )  # fmt: skip
 
 
@@ -360,23 +378,33 @@ def _preshift(capture: Capture, config: RunConfig) -> tuple[int, int]:
 
 
 def _band_rows(
-    config: RunConfig, problem: Problem, layout: TensorLayout, ranges: RangePlan | None, rows: int, cols: int
+    config: RunConfig,
+    problem: Problem,
+    layout: TensorLayout,
+    ranges: RangePlan | None,
+    n_cameras: int,
+    rows: int,
+    cols: int,
 ) -> tuple[int, int]:
     """Rows of a unit, and the memory that it takes."""
     itemsize = 4 if config.precision == "f32" else 8
 
     def size(n: int) -> int:
-        band = Band.of(problem.sampling, n, cols, config.window.stride)
+        # Two more rows and columns for the growth at the edges.
+        band = Band.of(problem.sampling, n + 2, cols + 2, config.window.stride)
         total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
+        read = band
         if ranges and ranges.depth and ranges.layout:
             depth = ranges.depth
-            before = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
-            total += band_bytes(depth.columns, ranges.layout, depth.sampling, before, itemsize)
+            read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
+            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize)
         own = problem.own_flows
         if own:
             total += len(own.steps) * band_bytes(
                 own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize
             )
+        if config.filters.prefilter != "none":
+            total += prefilter_bytes(config.filters.sigma_pre, n_cameras, read.in_rows, read.in_cols, itemsize)
         return total
 
     limit = int(0.8 * config.plan.max_memory)

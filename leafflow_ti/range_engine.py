@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ class Sample:
 class RangeEngine:
     """Makes the samples of range flow for bands of one size; ``outer`` is the block of images that it needs."""
 
-    def __init__(self, device: Device, plan: RangePlan, sampling: Sampling, f_px: float, band: Band):
+    def __init__(self, device: Device, plan: RangePlan, sampling: Sampling, view: View, band: Band):
         self.plan, self.band, self._radius = plan, band, window_radius(sampling)
         rows, cols = band.in_rows, band.in_cols
         self.gradients = GradientStage(device, sampling, rows, cols) if plan.gradients else None
@@ -49,8 +49,8 @@ class RangeEngine:
         if plan.depth is not None and plan.layout is not None:
             self.outer = Band.of(plan.depth.sampling, rows, cols, 1)
             self._tensor = TensorStage(device, plan.depth.columns, plan.layout, plan.depth.sampling, self.outer)
-            view = View(f_px, (0.0, 0.0), (1.0, 1.0), (0.0, 0.0), 0, 0, 1, rows, cols, self._tensor.out_pitch)
-            self._estimate = EstimateStage(device, plan.depth, plan.layout, view)
+            own = replace(view, step=1, rows=rows, cols=cols, pitch=self._tensor.out_pitch)
+            self._estimate = EstimateStage(device, plan.depth, plan.layout, own)
 
     def move(self, view: View, corner: tuple[int, int]) -> tuple[int, int]:
         """Go to the band whose block begins at pixel (y, x) ``corner``; the corner of ``outer``'s block.
@@ -59,12 +59,10 @@ class RangeEngine:
         """
         if self._tensor is not None and self._estimate is not None:
             self._tensor.reset()
+            own = self._estimate.view
             self._estimate.set_view(
-                View(
-                    view.f_px, view.principal_px, view.baseline_mm, view.shift_px, corner[1], corner[0], 1,
-                    self.outer.rows, self.outer.cols, self._tensor.out_pitch,
-                )
-            )  # fmt: skip
+                replace(view, x=corner[1], y=corner[0], step=1, rows=own.rows, cols=own.cols, pitch=own.pitch)
+            )
         self._corner = corner
         return corner[0] - self.outer.halo_y, corner[1] - self.outer.halo_x
 

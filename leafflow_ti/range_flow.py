@@ -8,8 +8,8 @@ A surface point with the velocity (U, V, W) [mm/frame] obeys, at the image posit
 and the second also with a derivative of the image along x or y in the place of I. With the window's centre (x0, y0) and
 ``U' = U - x0/f W``, ``V' = V - y0/f W`` the offsets (Δx, Δy) take the place of (x, y): both are data vectors of the
 columns (U', V', W), whose tensors add up. The unknowns are counted in px/frame, as displacements in the image at a
-working distance Zr: ``f/Zr`` times U' and V', and ``r/Zr`` times W, its displacement at the distance r from the window's
-centre, the root of the window's second moment. Columns and thresholds are then those of optical flow.
+working distance Zr: ``f/Zr`` times U' and V', and ``r/Zr`` times W, its displacement at the distance r from the centre,
+the root of the window's second moment. Columns and thresholds are then those of optical flow.
 
 Weights. Every constraint is scaled to the noise of the intensity: with noise σ_I of the images and σ_Z of the range
 [mm], the range constraint gets the factor ``σ_I / (β σ_Z)``, that of a derivative of the image 1 over the norm of its

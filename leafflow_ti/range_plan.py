@@ -95,6 +95,8 @@ def range_problem(
         raise ConfigError("model 'range-flow' needs the focal length: add [camera] focal_length_px to the capture.toml")
     image = capture.read(capture.n_frames // 2, *capture.reference, 0, capture.height, 0, capture.width, np.float64)
     noise = white_noise(image, capture.dtype.kind in "bui")
+    if config.filters.prefilter == "homomorphic":
+        noise /= float(np.median(image[image > 0])) if (image > 0).any() else 1.0  # that of the logarithm
     given = None
     if depth is None:
         assert chosen.depth is not None

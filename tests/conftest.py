@@ -13,6 +13,7 @@ import pytest
 from reference import chain
 
 from leafflow_ti.filters import filter_set
+from leafflow_ti.growth import DIFFERENCES
 from leafflow_ti.models import BRIGHTNESS, MODELS, OWN_FLOW, ColumnSet, TensorLayout, column_set, parse_rows
 from leafflow_ti.plan import MOTION_NAMES
 from leafflow_ti.runtime import Device, start
@@ -126,6 +127,12 @@ class Estimated:
 
         plane = Output.MOTION + MOTION_NAMES.index(name) if name in MOTION_NAMES else Output[name.upper()]
         return self.planes[plane], self.planes[Output.STD + plane]
+
+    def difference(self, name: str) -> np.ndarray:
+        """Values [rows, cols] of one of ``growth.DIFFERENCES``."""
+        from leafflow_ti.kernels.maps import Output
+
+        return self.planes[Output.DIFFERENCES + DIFFERENCES.index(name)]
 
     @property
     def status(self) -> np.ndarray:

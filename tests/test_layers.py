@@ -22,6 +22,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime",), 4),
     **dict.fromkeys(("stages",), 5),
+    **dict.fromkeys(("growth",), 5),
     **dict.fromkeys(("plan", "pipeline", "range_plan", "range_source", "range_engine", "results"), 6),
     **dict.fromkeys(("quicklook", "api"), 7),
     **dict.fromkeys(("cli",), 8),

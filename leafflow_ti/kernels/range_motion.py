@@ -20,11 +20,13 @@ def range_motion_kernel(spec: KernelSpec):
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """``U = U' + x0/f W``, ``V = V' + y0/f W``, from px to mm."""
+        """``U = U' + x0/f W``, ``V = V' + y0/f W``, from px to mm; and the covariance of the velocity's difference
+        quotients, its errors taken for those of window means."""
         parameters = base + (number[Region.PARAMETERS] + number[Number.MOTION_SOLUTION] * number[Number.FLOW]) * stride
         rows = base + number[Region.COV_T] * stride
         motion = base + number[Region.MOTION] * stride
         spread = base + number[Region.MOTION_COV] * stride
+        quotients = base + number[Region.DIFFERENCE_COV] * stride
         for i in range(lanes):
             ray = patch.pixel_ray(pixel + i, number, value)
             turn = ti.Matrix.identity(precise, 3) * value[Value.MOTION_SCALE]
@@ -42,5 +44,8 @@ def range_motion_kernel(spec: KernelSpec):
                 ws[motion + r * stride + i] = q[r]
                 for c in ti.static(range(3)):
                     ws[spread + (3 * r + c) * stride + i] = cov[r, c]
+                    for axis in ti.static(range(2)):
+                        factor = value[Value.DIFFERENCE + 7 * axis]
+                        ws[quotients + (9 * axis + 3 * r + c) * stride + i] = factor * factor * cov[r, c]
 
     return batch_kernel(spec, range_motion)

@@ -24,7 +24,7 @@ from leafflow_ti.stages.planes import Filtering, Terms, round_up
 
 EXTRA_PLANES = 4
 """Behind the tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
-OUTPUT_PLANES = 49
+OUTPUT_PLANES = 61
 FACTOR_PLANES = 4
 """Planes that derived channels may be multiplied by."""
 _CAMERA = ("sy", "sx")
