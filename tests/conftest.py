@@ -33,7 +33,7 @@ CASES = [
     if (row.cameras == "reference") == (grid == "single")
     if model != "affine-5d" or grid == "square"
     if row.time or brightness != "temporal"
-    if not row.own_flows
+    if not row.own_flows and not row.ranges
 ]
 """Every tensor with every brightness model and every grid that it exists for."""
 

@@ -168,7 +168,8 @@ class Number(IntEnum):
     TERMS = auto()  # G: geometry terms (1, x, y, t), 0 without a grid
     OFFSETS = auto()  # number of motion offsets
     ROWS_S = auto()  # rows of a camera solution: 2 G, and one for brightness if the model has it
-    ROWS_T = auto()  # rows of the motion solution: 2 OFFSETS + BRIGHTNESS_ROWS
+    ROWS_T = auto()  # rows of the motion solution: MOTION_FLOW + BRIGHTNESS_ROWS
+    MOTION_FLOW = auto()  # its flow rows: 2 OFFSETS; of range flow 3
     USE_RANGE = auto()
     UNKNOWNS = auto()  # of the motion fit; 0 without one
     WEIGHTED = auto()  # weighted least squares, else plain
@@ -176,7 +177,6 @@ class Number(IntEnum):
     CORRELATED = auto()  # columns of the reference model whose noise other cameras share; 0 without them
     BRIGHTNESS_COLUMN = auto()  # column of I, or -1
     BRIGHTNESS_ROWS = auto()  # brightness rows of the motion solution, behind its flow rows
-    WORLD_ROW = auto()  # the first of its rows of IΔx, IΔy, IΔt
     WORLD_MAPS = auto()  # brightness in world coordinates: 2 along X, Y; 3 with the trend; 0 without slopes
     CENTRE_TERMS = auto()  # what centred squares add to the value at the window's centre
     NOISE_TERMS = auto()  # terms of each solution's noise beyond the ratios
@@ -224,7 +224,8 @@ class Value(IntEnum):
     ROUGHEST = auto()  # share of the gradient's energy that one more smoothing leaves, below which it is noise
     MAX_RESIDUAL = auto()  # px, for status incoherent
     MAX_SHIFT = auto()  # px per step or frame, likewise
-    GAP = auto()  # convergence: residual per gap
+    MOTION_SCALE = auto()  # 2: mm per px of range flow's U', V', and of W
+    GAP = MOTION_SCALE + 2  # convergence: residual per gap
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9

@@ -71,7 +71,7 @@ def shares(columns: ColumnSet):
     flow = columns.columns[: columns.n_flow]
     T = np.eye(columns.n_flow)
     for i, column in enumerate(flow):
-        for term in column.terms[1:]:
+        for term in column.terms[1:] if max(column.terms[0].exponents) > 1 else ():
             T[i, [c.terms[0] for c in flow].index(replace(term, factor=1.0))] = term.factor
     return T
 
