@@ -63,15 +63,10 @@ class Cell:
 
 
 def number(value: float) -> str:
-    """Three digits, without an exponent where four decimals are enough."""
+    """Three digits; whole numbers from 1000 on."""
     if not math.isfinite(value):
         return "–"
-    size = abs(value)
-    if size == 0.0 or 1e-4 <= size < 1e4:
-        digits = 3 if size == 0.0 else max(0, 2 - math.floor(math.log10(size)))
-        text = f"{value:.{min(digits, 6)}f}"
-        return text.rstrip("0").rstrip(".") if "." in text else text
-    return f"{value:.2g}"
+    return f"{value:.3g}" if abs(value) < 1000.0 else f"{value:.0f}"
 
 
 def select(result: Result | None, selection: Selection) -> Record | None:
@@ -114,7 +109,7 @@ def _failure(result: Result, selection: Selection) -> str:
     for failure in result.failures:
         if all(getattr(failure, k) == selection[k] for k in ("panel", "variant", "x") if k in selection):
             return "not measured, see below"
-    return "" if result.failures or "variant" not in selection else "not a result of this model"
+    return ""
 
 
 def _text(mean: float, std: float | None) -> str:
