@@ -137,6 +137,11 @@ def diagram_cell(diagram: Diagram, result: Result) -> Cell | None:
     return replace(cell, reason=diagram.reason if cell.better is False else "")
 
 
+def diagram_cells(experiment: Experiment, result: Result) -> list[Cell]:
+    """The checks of all diagrams with a printed range."""
+    return [cell for diagram in experiment.diagrams if (cell := diagram_cell(diagram, result))]
+
+
 def curve(diagram: Diagram, label: str, result: Result) -> list[tuple[float, float]]:
     """Points (x, value) of one curve, in the order of x."""
     panel, variant = diagram.curves[label]
@@ -151,7 +156,7 @@ def curve(diagram: Diagram, label: str, result: Result) -> list[tuple[float, flo
 def experiment_cells(experiment: Experiment, result: Result) -> list[Cell]:
     """All cells of an experiment that have a reference."""
     cells = [cell for table in experiment.tables for row in table_cells(table, result) for cell in row]
-    cells += [cell for diagram in experiment.diagrams if (cell := diagram_cell(diagram, result))]
+    cells += diagram_cells(experiment, result)
     return [cell for cell in cells if cell.better is not None or cell.met is not None]
 
 

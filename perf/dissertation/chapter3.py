@@ -83,14 +83,14 @@ CURVES = {f"{grid}, slope along {axis.upper()}": (rows, axis) for (grid, rows), 
 
 
 def _normals(panel: str, rows: int, points: tuple[Point, ...]) -> Panel:
-    return Panel(panel, points, DEPTH, (-14, -14 if rows > 1 else 0), middle(points[0].scene), 4, seeds=3)
+    return Panel(panel, points, DEPTH, (-14, -14 if rows > 1 else 0), middle(points[0].scene), 4, seeds=6)
 
 
 FIGURE_35 = Experiment(
     "figure-3.5",
     "Figures 3.5 and 3.6: surface normals from 1D and 2D grids",
     "Static sinusoid at 100 mm, f = 12 mm at 4.4 µm pitch, 9 or 9 x 9 cameras 0.5 mm apart, wavelengths 0.3 mm, grey "
-    "values 100 ± 50; noise 2.5 grey values against the slope, slope 45° against the noise; 3 sequences.",
+    "values 100 ± 50; noise 2.5 grey values against the slope, slope 45° against the noise; 6 sequences.",
     "Of the print only the topic is known here; no numbers are compared.",
     tuple(
         _normals(f"slopes, {label}", rows, tuple(Point(angle, _static(rows, angle, axis, 2.5)) for angle in SLOPES))

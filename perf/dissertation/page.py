@@ -6,10 +6,11 @@ import base64
 import json
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
-from perf.dissertation.cells import Cell, curve, diagram_cell, experiment_cells, goal_cells, number, table_cells
+from perf.dissertation.cells import Cell, curve, diagram_cells, experiment_cells, goal_cells, number, table_cells
 from perf.dissertation.experiment import Experiment, Table
 from perf.dissertation.goals import EXPERIMENTS, GOALS
 from perf.dissertation.measure import Result
@@ -65,7 +66,7 @@ def _summary(results: Mapping[str, Result]) -> str:
     compared = [cell for cell in cells if cell.better is not None]
     better = sum(cell.better is True for cell in compared)
     quick = any(result.quick for result in results.values())
-    versions = ", ".join(sorted({f"leafflow-ti {r.version} on {r.device or 'no device'}" for r in results.values()}))
+    versions = ", ".join(sorted({f"leafflow-ti {r.version} on {r.device}" for r in results.values() if r.device}))
     minutes = sum(result.seconds for result in results.values()) / 60.0
     return (
         f"<p><b>{better} of {len(compared)}</b> compared cells are at or below the printed value. "
@@ -75,20 +76,24 @@ def _summary(results: Mapping[str, Result]) -> str:
 
 
 def _goals(results: Mapping[str, Result]) -> str:
-    rows = ["<h2>Goals of this project</h2>"]
-    for goal in GOALS:
-        cells = goal_cells(goal, results)
-        body = "".join(_goal_row(cell) for cell in cells)
-        rows.append(f"<table><caption>{escape(goal.text)}</caption><tr><th>value</th><th>measured</th><th>at most</th>")
-        rows.append(f"<th></th></tr>{body}</table>")
-    return "\n".join(rows)
+    groups = [(goal.text, goal_cells(goal, results)) for goal in GOALS]
+    for experiment in (e for e in EXPERIMENTS if e.name in results):
+        checks = diagram_cells(experiment, results[experiment.name])
+        title = experiment.title.partition(":")[0]
+        groups.append((f"Sinusoids, {title}: within the printed range", [replace(c, goal=c.reference) for c in checks]))
+    rows = ["<h2>Goals of this project</h2><table><tr><th>value</th><th>measured</th><th>at most</th><th></th></tr>"]
+    for text, cells in groups:
+        rows += [f'<tr><th colspan="4">{escape(text)}</th></tr>'] if cells else []
+        rows += [_goal_row(cell) for cell in cells]
+    return "\n".join([*rows, "</table>"])
 
 
 def _goal_row(cell: Cell) -> str:
     limit = number(math.nan if cell.goal is None else cell.goal)
     mark = '<td class="good"><b>met</b></td>' if cell.met else '<td class="bad"><b>not met</b></td>'
     note = f"<small>{escape(cell.note)}</small>" if cell.note else ""
-    return f"<tr><td>{escape(cell.row)}</td><td>{escape(cell.text)}{note}</td><td>{limit}</td>{mark}</tr>"
+    name = ": ".join(filter(None, (cell.row, cell.column)))
+    return f"<tr><td>{escape(name)}</td><td>{escape(f'{cell.text} {cell.unit}')}{note}</td><td>{limit}</td>{mark}</tr>"
 
 
 def _experiment(folder: Path, experiment: Experiment, result: Result) -> str:
@@ -98,7 +103,7 @@ def _experiment(folder: Path, experiment: Experiment, result: Result) -> str:
         f'<p class="quiet">{escape(experiment.known)}</p>',
         *(_table(table, result) for table in experiment.tables),
     ]
-    checks = [cell for diagram in experiment.diagrams if (cell := diagram_cell(diagram, result))]
+    checks = diagram_cells(experiment, result)
     if checks:
         body = "".join(f"<tr><td>{escape(c.row)}</td><td>{escape(c.column)}</td>{_td(c)}</tr>" for c in checks)
         parts.append(
@@ -161,7 +166,7 @@ def _values(results: Mapping[str, Result]) -> dict[str, object]:
 
 def _experiment_values(experiment: Experiment, result: Result) -> dict[str, object]:
     tables = [[cell.to_json() for row in table_cells(t, result) for cell in row] for t in experiment.tables]
-    checks = [cell.to_json() for d in experiment.diagrams if (cell := diagram_cell(d, result))]
+    checks = [cell.to_json() for cell in diagram_cells(experiment, result)]
     curves = [
         {
             "title": d.title, "quantity": d.quantity, "statistic": d.statistic, "region": d.region, "x": d.x_label,
