@@ -80,11 +80,11 @@ def draw_maps(path: Path, result: Result) -> Path | None:
     panels = []
     for (_, label), maps in result.maps.items():
         panels += [
-            Panel(f"{label}: angular error of N [deg]", maps["error"], (0.0, 1.0), "magma"),
+            Panel(f"{label}: angular error of N [deg]", maps["error"], (0.0, 0.5), "magma"),
             Panel(
                 f"{label}: N (colour: Z [mm/frame])",
                 maps["velocity"][..., 2],
-                (-1.1, -0.9),
+                (-1.05, -0.95),
                 arrows=maps["velocity"][..., :2],
             ),
         ]
