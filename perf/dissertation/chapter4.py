@@ -80,17 +80,19 @@ def _brightness_diagrams(kind: str) -> tuple[Diagram, ...]:
 FIGURE_44 = Experiment(
     "figure-4.4",
     "Figures 4.4 to 4.7: brightness models",
-    "Translating sinusoid (section 5.3 without rotation) whose brightness changes as exp(h): h = g t, with a slope "
-    "of g along X, with g2 t², and with a slope of g2; without noise, and g = .02 with a slope of .03 against the noise "
-    "(2 sequences). Affine Model with each brightness model; 2nd order means the optional terms. Errors of g are root mean squares.",
+    "Translating sinusoid (section 5.3 without rotation) whose brightness changes as exp(h): h = g t, with a slope of "
+    "g along X, with g2 t², and with a slope of g2; without noise, and g = .02 with a slope of .03 against the noise (2 "
+    "sequences). Affine Model with each brightness model; 2nd order means the optional terms. Errors of g are root mean "
+    "squares.",
     "Of the print only the topic is known here; no numbers are compared, and which kind of change is which figure is "
     "our choice.",
     tuple(PANELS_44.values()),
     diagrams=tuple(diagram for kind in PANELS_44 for diagram in _brightness_diagrams(kind)),
     notes=(
         "A slope of g2 biases N in proportion, whatever the model: the derivative filters also smooth along time, and "
-        "the smoothed product of I and a brightness change that grows with t is not I Δt but I Δt + m It, m the variance "
-        "of the filter. The error looks like a divergence of the flow, m times the slope of 2 g2 times the flow.",
+        "the smoothed product of I and a brightness change that grows with t is not I Δt but I Δt + m It, m the "
+        "variance of the filter. The error looks like a divergence of the flow: m times the slope of 2 g2 times the "
+        "flow.",
     ),
 )  # fmt: skip
 

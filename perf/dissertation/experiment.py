@@ -26,16 +26,16 @@ class Quantity(NamedTuple):
 
 
 QUANTITIES: dict[str, Quantity] = {
-    "N": Quantity("velocity_aae_deg", "velocity N, angular error", "deg"),
-    "Omega": Quantity("rotation_aae_deg", "rotation Ω, angular error", "deg"),
-    "A": Quantity("acceleration_aae_deg", "acceleration A, angular error", "deg"),
-    "normal": Quantity("normal_deg", "surface normal, angular error", "deg"),
-    "Z0": Quantity("depth_mm", "depth, error", "mm"),
-    "ZY": Quantity("slope_y_deg", "slope along Y, error", "deg"),
+    "N": Quantity("velocity_aae_deg", "AAE of N", "deg"),
+    "Omega": Quantity("rotation_aae_deg", "AAE of Ω", "deg"),
+    "A": Quantity("acceleration_aae_deg", "AAE of A", "deg"),
+    "normal": Quantity("normal_deg", "angle between normals", "deg"),
+    "Z0": Quantity("depth_mm", "error of depth", "mm"),
+    "ZY": Quantity("slope_y_deg", "error of slope along Y", "deg"),
     "RGR": Quantity("growth_rate", "relative growth rate", "%/frame"),
-    "g": Quantity("brightness_t", "brightness change g, error", "1/frame"),
-    "gx": Quantity("brightness_world_x", "slope of g along X, error", "1/(frame mm)"),
-    "g2": Quantity("brightness_world_tt", "second-order change 2 g2, error", "1/frame²"),
+    "g": Quantity("brightness_t", "error of g", "1/frame"),
+    "gx": Quantity("brightness_world_x", "error of dg/dX", "1/(frame mm)"),
+    "g2": Quantity("brightness_world_tt", "error of 2 g2", "1/frame²"),
 }
 """Short name -> what is recorded. Angular errors are those of (A.2); the others are signed."""
 

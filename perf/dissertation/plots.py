@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
@@ -58,12 +59,15 @@ def _draw(axes: Any, diagram: Diagram, result: Result, handles: dict[str, Any]) 
     for k, label in enumerate(diagram.curves):
         points = np.array(curve(diagram, label, result)).reshape(-1, 2)
         (line,) = axes.plot(
-            *points.T, color=COLOURS[k % len(COLOURS)], marker=MARKERS[k % len(MARKERS)], markersize=4.5,
+            *points.T, color=COLOURS[k % len(COLOURS)], marker=MARKERS[k % len(MARKERS)], markersize=8.0 - 0.7 * k,
             linestyle="--" if "acc." in label or "2nd" in label else "-", linewidth=1.3, markerfacecolor="none",
         )  # fmt: skip
         if len(points):
             handles.setdefault(label, line)
     axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    if high < 10.0 * low:  # small changes should look small
+        axes.set_ylim(math.sqrt(low * high / 10.0), math.sqrt(low * high * 10.0))
     if diagram.x_log:
         axes.set_xscale("log")
     axes.set_xlabel(diagram.x_label)
