@@ -81,8 +81,8 @@ FIGURE_44 = Experiment(
     "figure-4.4",
     "Figures 4.4 to 4.7: brightness models",
     "Translating sinusoid (section 5.3 without rotation) whose brightness changes as exp(h): h = g t, with a slope of "
-    "g along X, with g2 t², and with a slope of g2; without noise, and g = .02 with a slope of .03 against the noise (2 "
-    "sequences). Affine Model with each brightness model; 2nd order means the optional terms. Errors of g are root mean "
+    "g along X, with g2 t², and with a slope of g2; without noise, and g = .02 with a slope of .03 against the noise, "
+    "2 sequences. Affine Model with each brightness model; 2nd order: with the optional terms. Errors of g are root mean "
     "squares.",
     "Of the print only the topic is known here; no numbers are compared, and which kind of change is which figure is "
     "our choice.",
@@ -215,7 +215,7 @@ FIGURE_417 = Experiment(
     "figure-4.17",
     "Figures 4.17 and 4.18: error maps and motion under a fixed spot",
     "The cube of Table 4.1, Affine Model without rotation and with four brightness models: angular error of N at every "
-    "pixel, and the motion (arrows along X and Y, colours along Z).",
+    "pixel, and the motion (arrows along X and Y, colours along Z). At the rim the windows see the background.",
     "Of the print only the topic is known here; no numbers are compared.",
     (CUBE_417,),
     (

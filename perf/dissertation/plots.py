@@ -86,12 +86,10 @@ def draw_maps(path: Path, result: Result) -> Path | None:
         panels += [
             Panel(f"{label}: angular error of N [deg]", maps["error"], (0.0, 0.5), "magma"),
             Panel(
-                f"{label}: N (colour: Z [mm/frame])",
-                maps["velocity"][..., 2],
-                (-1.05, -0.95),
-                arrows=maps["velocity"][..., :2],
+                f"{label}: N (colour: Z [mm/frame])", maps["velocity"][..., 2], (-1.05, -0.95),
+                arrows=maps["velocity"][..., :2], arrow_step=8,
             ),
-        ]
+        ]  # fmt: skip
     return draw(path, panels, 2, 5.0)
 
 
