@@ -82,8 +82,8 @@ FIGURE_44 = Experiment(
     "Figures 4.4 to 4.7: brightness models",
     "Translating sinusoid (section 5.3 without rotation) whose brightness changes as exp(h): h = g t, with a slope of "
     "g along X, with g2 t², and with a slope of g2; without noise, and g = .02 with a slope of .03 against the noise, "
-    "2 sequences. Affine Model with each brightness model; 2nd order: with the optional terms. Errors of g are root mean "
-    "squares.",
+    "2 sequences. Affine Model with each brightness model; 2nd order: with the optional terms. Errors of g are root "
+    "mean squares.",
     "Of the print only the topic is known here; no numbers are compared, and which kind of change is which figure is "
     "our choice.",
     tuple(PANELS_44.values()),
