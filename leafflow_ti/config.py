@@ -21,8 +21,11 @@ from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
 
 Preset = Literal["fast", "balanced", "accurate"]
-ModelName = Literal["auto", "flow", "flow-affine", "depth", "affine-translation", "affine", "affine-4d", "affine-5d"]
-Motion = Literal["translation", "rotation", "acceleration"]
+ModelName = Literal[
+    "auto", "flow", "flow-affine", "depth", "affine-translation", "affine", "affine-4d", "affine-5d", "scene-flow",
+    "affine-scene-flow",
+]  # fmt: skip
+Motion = Literal["auto", "translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
 Estimator = Literal["ols", "tls", "tls-equilibrated"]
 Solver = Literal["fast", "jacobi"]
@@ -119,10 +122,11 @@ class _Section(BaseModel):
 
 
 class ModelSection(_Section):
-    """Which parameters are estimated, and how. ``rows`` of the 3D fit: ``auto`` or ``2d`` followed by ``+b5+as+at``."""
+    """Which parameters are estimated, and how. ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its
+    derivatives along x, y) followed by any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can."""
 
     name: ModelName = "auto"
-    motion: Motion = "rotation"
+    motion: Motion = "auto"
     rows: str = "auto"
     brightness: Brightness = "none"
     estimator: Estimator = "tls-equilibrated"
@@ -134,9 +138,9 @@ class ModelSection(_Section):
     def _check_rows(cls, value: str) -> str:
         first, *extra = value.split("+")
         if value != "auto" and (
-            first != "2d" or len(set(extra)) < len(extra) or not {"b5", "as", "at"}.issuperset(extra)
+            first not in ("u", "2d") or len(set(extra)) < len(extra) or not {"b5", "as", "at"}.issuperset(extra)
         ):
-            raise ValueError('must be "auto", or "2d" followed by any of +b5, +as, +at, each at most once')
+            raise ValueError('must be "auto", or "2d" or "u" followed by any of +b5, +as, +at, each at most once')
         return "+".join([first, *(row for row in ("b5", "as", "at") if row in extra)])
 
 
@@ -335,7 +339,7 @@ def load_config(
 def resolve_model(name: str, n_frames: int, n_rows: int, n_cols: int) -> str:
     """The model that ``auto`` means for a capture; every other name is returned as it is.
 
-    One camera: ``flow-affine``; a grid without time: ``depth``; with time ``affine-4d`` (1D) or ``affine-5d`` (2D).
+    One camera: ``flow-affine``; a grid without time: ``depth``; with time ``affine-scene-flow``.
     """
     if name != "auto":
         return name
@@ -343,7 +347,7 @@ def resolve_model(name: str, n_frames: int, n_rows: int, n_cols: int) -> str:
         return "flow-affine"
     if n_frames == 1:
         return "depth"
-    return "affine-4d" if min(n_rows, n_cols) == 1 else "affine-5d"
+    return "affine-scene-flow"
 
 
 def _read_file(path: Path) -> dict[str, tuple[object, str]]:

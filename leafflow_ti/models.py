@@ -31,23 +31,36 @@ class Model:
 
     ``offsets``: the axes along which the flow varies inside a window, ``"s"`` standing for every camera axis.
     ``cameras``: ``"reference"`` (one camera), ``"line"`` (the row or column through the reference camera) or
-    ``"grid"``.
+    ``"grid"``. ``motions``: what the 3D fit may solve for, the default first. ``own_flows``: every camera's own flow
+    (6.15) enters the fit; ``reference_rows``: so do the rows of the reference camera.
     """
 
     offsets: tuple[str, ...]
     cameras: str
     time: bool
     summary: str
+    motions: tuple[str, ...] = ()
+    own_flows: bool = False
+    reference_rows: bool = True
 
 
+ANY_MOTION = ("rotation", "translation", "acceleration")
+OWN_FLOW = Model(("x", "y", "t"), "reference", True, "flow of one camera of the affine scene flow model, 13 columns")
 MODELS: dict[str, Model] = {
     "flow": Model((), "reference", True, "optical flow, constant in the window (2.3)"),
     "flow-affine": Model(("x", "y"), "reference", True, "optical flow, affine in the window (2.6)"),
     "depth": Model(("x", "y", "s"), "grid", False, "depth and normals of a static scene"),
-    "affine-translation": Model((), "grid", True, "disparity and flow, constant in the window"),
-    "affine": Model(("x", "y"), "grid", True, "depth, normals and motion (3.38), (3.39)"),
-    "affine-4d": Model(("x", "y", "s", "t"), "line", True, "4D affine model (5.24)"),
-    "affine-5d": Model(("x", "y", "s", "t"), "grid", True, "5D affine model (6.10)"),
+    "affine-translation": Model((), "grid", True, "disparity and flow, constant in the window", ("translation",)),
+    "affine": Model(("x", "y"), "grid", True, "depth, normals and motion (3.38), (3.39)", ANY_MOTION),
+    "affine-4d": Model(("x", "y", "s", "t"), "line", True, "4D affine model (5.24)", ANY_MOTION),
+    "affine-5d": Model(("x", "y", "s", "t"), "grid", True, "5D affine model (6.10)", ANY_MOTION),
+    "scene-flow": Model(
+        ("x", "y", "s", "t"), "grid", True, "velocity from the flow of every camera (3.4)", ("translation",), True, False
+    ),
+    "affine-scene-flow": Model(
+        ("x", "y", "s", "t"), "grid", True, "4D or 5D affine model and the affine flow of every camera (6.15)",
+        ANY_MOTION, True,
+    ),
 }
 
 BRIGHTNESS: dict[str, tuple[str, ...]] = {
@@ -58,7 +71,7 @@ BRIGHTNESS: dict[str, tuple[str, ...]] = {
 }
 """Offsets of the intensity columns: constancy, Haussecker-Fleet (4.15), spatially varying (4.27), full (6.1)."""
 
-ROW_AXES: dict[str, tuple[str, ...]] = {"2d": ("x", "y"), "as": ("sx", "sy"), "at": ("t",)}
+ROW_AXES: dict[str, tuple[str, ...]] = {"u": (), "2d": ("x", "y"), "as": ("sx", "sy"), "at": ("t",)}
 """Which offsets of the motion each group of rows uses, besides the motion itself (section 5.2)."""
 
 
@@ -179,18 +192,12 @@ def parse_rows(rows: str, model: str, motion: str, columns: ColumnSet) -> tuple[
         use_range = has_range
     else:
         groups = rows.split("+")
-        use_range = "b5" in groups
-        groups = [g for g in groups if g != "b5"]
         for g in groups:
-            if g not in ROW_AXES:
-                raise ConfigError(
-                    f"rows '{rows}': unknown group '{g}'; allowed are 2d, b5, as, at joined by '+', or auto"
-                )
-            if not have & set(ROW_AXES[g]):
+            measured = has_range if g == "b5" else not ROW_AXES[g] or bool(have & set(ROW_AXES[g]))
+            if not measured:
                 raise ConfigError(
                     f"rows '{rows}': model '{model}' does not measure group '{g}' on this capture; leave it out"
                 )
-        if use_range and not has_range:
-            raise ConfigError(f"rows '{rows}': model '{model}' does not measure b5 on this capture; leave it out")
+        use_range = "b5" in groups
     offsets = ("1", *(a for g in ROW_AXES if g in groups for a in ROW_AXES[g] if a in have))
     return offsets, use_range

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import read_gray
 from leafflow_ti.errors import ConfigError
+from leafflow_ti.models import TensorLayout
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import EstimateStage, View
@@ -45,10 +46,28 @@ class Timings:
 
 @dataclass
 class _Engine:
-    """The two stages for bands of one height."""
+    """The stages for bands of one height: tensor of the reference model, tensors of the own flows, estimate.
+
+    ``inner``: the cameras of a block under the filters and window of the reference model; ``own_cameras``: place of
+    each own flow's camera in a block.
+    """
 
     tensor: TensorStage
+    own: list[TensorStage]
     estimate: EstimateStage
+    inner: tuple[slice, slice]
+    own_cameras: list[tuple[slice, slice]]
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        for stage in (self.tensor, *self.own):
+            stage.reset()
+
+    def push(self, block: NDArray[Any], valid: NDArray[np.bool_]) -> tuple[Any, list[Any]] | None:
+        """Add a frame [sy, sx, rows, cols] of every camera; the tensors once the windows are full."""
+        tensor = self.tensor.push(block[self.inner], valid)
+        own = [stage.push(block[at], valid) for stage, at in zip(self.own, self.own_cameras, strict=True)]
+        return None if tensor is None else (tensor, own)
 
 
 class Pipeline:
@@ -76,10 +95,10 @@ class Pipeline:
             engine = self._make_engine(band)
             shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
             grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
-            tensor = None
-            while tensor is None:
-                tensor = engine.tensor.push(grey, np.ones(shape[2:], bool))
-            engine.estimate(tensor)
+            tensors = None
+            while tensors is None:
+                tensors = engine.push(grey, np.ones(shape[2:], bool))
+            engine.estimate(*tensors)
             self.device.synchronize()
         return self.timings.seconds["compile"]
 
@@ -92,11 +111,22 @@ class Pipeline:
                     deliver(unit, maps, status)
 
     def _make_engine(self, band: Band) -> _Engine:
-        plan = self.plan
-        tensor = TensorStage(self.device, plan.problem.columns, plan.layout, plan.problem.sampling, band)
-        return _Engine(
-            tensor, EstimateStage(self.device, plan.problem, plan.layout, self._view((0, 0), band, tensor.out_pitch))
-        )
+        plan, problem = self.plan, self.plan.problem
+        tensor = TensorStage(self.device, problem.columns, plan.layout, problem.sampling, band)
+        view = self._view((0, 0), band, tensor.out_pitch)
+        own = problem.own_flows
+        stages: list[TensorStage] = []
+        places: list[tuple[slice, slice]] = []
+        first = [cameras[0] - at for cameras, at in zip(plan.cameras, self.capture.reference, strict=True)]
+        if own:
+            layout = TensorLayout.of(own.columns)
+            stages = [TensorStage(self.device, own.columns, layout, own.sampling, band) for _ in own.steps]
+            for x, y in own.steps:
+                places.append((slice(y - first[0], y - first[0] + 1), slice(x - first[1], x - first[1] + 1)))
+        sy, sx = (slice(-f - axis.radius, -f + axis.radius + 1) for f, axis in zip(
+            first, (problem.sampling.sy, problem.sampling.sx), strict=True
+        ))  # fmt: skip
+        return _Engine(tensor, stages, EstimateStage(self.device, problem, plan.layout, view), (sy, sx), places)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
         """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.
@@ -137,7 +167,7 @@ class Pipeline:
         if band.rows not in self._engines:
             self._engines[band.rows] = self._make_engine(band)
         engine = self._engines[band.rows]
-        engine.tensor.reset()
+        engine.reset()
         engine.estimate.set_view(self._view((rows.start, cols.start), band, engine.tensor.out_pitch))
         corner = (plan.y[rows.start] - band.halo_y, plan.x[cols.start] - band.halo_x)
         inside, kept = self._inside(band, corner)
@@ -149,14 +179,14 @@ class Pipeline:
             with self.timings.of("read"):
                 block, finite[t] = self._read(t, band, corner)
             with self.timings.of("tensor"):
-                tensor = engine.tensor.push(block, inside & kept & finite[t])
+                tensors = engine.push(block, inside & kept & finite[t])
                 self.device.synchronize()
             frame = t - latency
             finite.pop(frame - 1, None)
-            if tensor is None:
+            if tensors is None:
                 continue
             with self.timings.of("estimate"):
-                maps, status = self._maps(engine.estimate(tensor), finite[frame][centre])
+                maps, status = self._maps(engine.estimate(*tensors), finite[frame][centre])
                 unit = plan.unit(first + frame - plan.frames[first], index)
                 result = self._frame_of(whole, maps, status, place)
             yield unit, *result

@@ -14,9 +14,9 @@ from leafflow_ti.capture import Capture, Geometry, find_preshift
 from leafflow_ti.config import RunConfig, resolve_model
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import choose_filter_set, filter_set
-from leafflow_ti.models import MODELS, TensorLayout, column_set, parse_rows
+from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set, parse_rows
 from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.estimate import Problem, unknowns_of
+from leafflow_ti.stages.estimate import OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -124,7 +124,14 @@ class Plan:
         if problem.unknowns:
             rows = "+".join(problem.offsets) + ("+b5" if problem.use_range else "")
             n_rows = 2 * len(problem.offsets) + problem.use_range
-            lines.append(f"motion      {problem.unknowns} unknowns from {n_rows} rows ({rows})")
+            own = problem.own_flows
+            taken = [f"{n_rows} rows ({rows})"] if own is None or own.reference_rows else []
+            if own:
+                taken.append(
+                    f"{2 * len(own.offsets)} rows ({'+'.join(own.offsets)}) of each of {len(own.steps)} cameras' own flow, "
+                    f"{own.columns.n} columns"
+                )
+            lines.append(f"motion      {problem.unknowns} unknowns from {' and '.join(taken)}")
         pixels = len(self.frames) * len(self.y) * len(self.x)
         limit = self.config.plan.max_memory
         lines += [
@@ -165,19 +172,25 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     )
     columns = column_set(model, config.model.brightness, sampling.camera_axes, sampling.sampled)
     grid = bool(sampling.camera_axes)
-    unknowns = unknowns_of(config.model.motion, columns) if grid and model.time else 0
-    offsets: tuple[str, ...] = ("1",)
-    use_range = False
-    if unknowns:
-        offsets, use_range = parse_rows(config.model.rows, name, config.model.motion, columns)
-    if unknowns > 2 * len(offsets) + use_range:
-        raise ConfigError(
-            f"motion '{config.model.motion}' has {unknowns} unknowns, rows '{config.model.rows}' give "
-            f"{2 * len(offsets) + use_range} equations: choose more rows, a simpler motion, or more frames and cameras"
-        )
+    motion = _motion(config, name)
+    offsets, use_range, fitted, own = ("1",), False, 0, None
+    if motion:
+        rows = config.model.rows if model.reference_rows else "2d"
+        offsets, use_range = parse_rows(rows, name, motion, columns)
+        fitted = unknowns_of(motion, columns)
+        n_rows = 2 * len(offsets) + use_range
+        if model.own_flows:
+            own = _own_flows(config, model, motion, offsets, sampling, (capture.n_rows, capture.n_cols), (row, col))
+            if motion == "translation":
+                fitted = min(fitted, n_rows)
+        if fitted > n_rows:
+            raise ConfigError(
+                f"motion '{motion}' has {fitted} unknowns, rows '{config.model.rows}' give {n_rows} equations: choose more "
+                "rows, a simpler motion, or more frames and cameras"
+            )
     problem = Problem(
         columns, sampling, config.model.estimator, config.model.solver, config.model.weighting == "wls",
-        offsets, use_range, unknowns,
+        offsets, use_range, fitted, own,
     )  # fmt: skip
     layout = TensorLayout.of(columns)
     x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
@@ -190,14 +203,53 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     band_rows, memory = _band_rows(config, problem, layout, len(y), len(x))
     return Plan(
         config, name, problem, layout, _geometry(capture),
-        (_around(row, sampling.sy.radius), _around(col, sampling.sx.radius)),
+        _cameras(sampling, own, row, col),
         _preshift(capture, config) if grid else (0, 0),
         _frames(capture, config, sampling.t.radius, model.time), y, x, band_rows, memory,
     )  # fmt: skip
 
 
-def _around(centre: int, radius: int) -> tuple[int, ...]:
-    return tuple(range(centre - radius, centre + radius + 1))
+def _motion(config: RunConfig, name: str) -> str | None:
+    """The motion that is fitted; None for a model without a 3D fit."""
+    wanted, motions = config.model.motion, MODELS[name].motions
+    if wanted != "auto" and wanted not in motions:
+        can = f"it measures {', '.join(motions)}" if motions else "it measures no 3D motion"
+        raise ConfigError(f"motion '{wanted}': model '{name}' does not have it, {can}: choose --motion auto or another model")
+    return (motions[0] if wanted == "auto" else wanted) if motions else None
+
+
+def _own_flows(
+    config: RunConfig, model: Model, motion: str, offsets: tuple[str, ...], sampling: Sampling,
+    counts: tuple[int, int], reference: tuple[int, int],
+) -> OwnFlows:  # fmt: skip
+    """The flow of every camera but the one whose rows the reference model gives."""
+    if not model.reference_rows:
+        if config.model.rows not in ("auto", "u"):
+            raise ConfigError(
+                f"rows '{config.model.rows}': model 'scene-flow' takes the flow alone: choose rows u, or affine-scene-flow"
+            )
+        offsets = ("1",)
+    alone = Sampling(sampling.x, sampling.y, t=sampling.t)
+    columns = column_set(OWN_FLOW, config.model.brightness, (), alone.sampled)
+    steps = [(i - reference[1], j - reference[0]) for j in range(counts[0]) for i in range(counts[1])]
+    if model.reference_rows:
+        steps.remove((0, 0))
+    unknowns = {"translation": 3, "rotation": 6, "acceleration": 9}[motion]
+    kept = tuple(o for o in offsets if o == "1" or columns.index("x", o) is not None)
+    return OwnFlows(columns, alone, tuple(steps), kept, unknowns, model.reference_rows)
+
+
+def _cameras(sampling: Sampling, own: OwnFlows | None, row: int, col: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Rows and columns of the cameras that are read: those under filters and window, or every one."""
+
+    def reached(centre: int, radius: int, steps: Iterable[int]) -> tuple[int, ...]:
+        return tuple(range(centre + min(-radius, *steps), centre + max(radius, *steps) + 1))
+
+    steps = own.steps if own else ()
+    return (
+        reached(row, sampling.sy.radius, (0, *(s[1] for s in steps))),
+        reached(col, sampling.sx.radius, (0, *(s[0] for s in steps))),
+    )
 
 
 def _check_model(name: str, capture: Capture) -> None:
@@ -264,7 +316,11 @@ def _band_rows(config: RunConfig, problem: Problem, layout: TensorLayout, rows: 
 
     def size(n: int) -> int:
         band = Band.of(problem.sampling, n, cols, config.window.stride)
-        return band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
+        total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
+        own = problem.own_flows
+        if own:
+            total += len(own.steps) * band_bytes(own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize)
+        return total
 
     limit = int(0.8 * config.plan.max_memory)
     if config.plan.tile != "auto":

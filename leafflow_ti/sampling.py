@@ -184,3 +184,28 @@ def cross_noise(sampling: Sampling, columns: ColumnSet, first: str, second: str)
             if a is not None and b is not None and base_a is not None and base_b is not None:
                 terms.append(CrossTerm(a, b, base_a, base_b, value))
     return tuple(terms)
+
+
+def shared_noise(
+    sampling: Sampling, columns: ColumnSet, own: ColumnSet, step: tuple[int, int]
+) -> list[tuple[int, float]]:
+    """What the motion solution of the columns of a grid has in common with one camera's own flow.
+
+    For every column a that is not time-like: the own column a' of the same channel and the same offset in x, y, t, and
+    the factor with ``Cov(Σ w f_a n, Σ w f_b n_c) = factor · Cov(Σ w f_a' n_c, Σ w f_b n_c)``: the share of camera c,
+    ``step`` = (x, y) steps from the reference, in the filters and the window along the camera axes. Partner -1: none.
+    """
+
+    def share(axis: AxisSampling, power: int, at: int) -> float:
+        seen = np.convolve(axis.kernel(False)[::-1], axis.window(power))
+        i = at + len(seen) // 2
+        return float(seen[i]) if 0 <= i < len(seen) else 0.0
+
+    found = []
+    for column in columns.columns[: columns.n_flow]:
+        e = dict(zip(AXES, column.exponents, strict=True))
+        factor = share(sampling.sx, e["sx"], step[0]) * share(sampling.sy, e["sy"], step[1])
+        own_column = Column(column.channel, tuple(0 if a in ("sx", "sy") else e[a] for a in AXES))
+        at = own.columns.index(own_column) if own_column in own.columns and factor != 0 else -1
+        found.append((at, factor))
+    return found

@@ -13,11 +13,11 @@ import pytest
 from reference import chain
 
 from leafflow_ti.filters import filter_set
-from leafflow_ti.models import BRIGHTNESS, MODELS, ColumnSet, TensorLayout, column_set, parse_rows
+from leafflow_ti.models import BRIGHTNESS, MODELS, OWN_FLOW, ColumnSet, TensorLayout, column_set, parse_rows
 from leafflow_ti.plan import MOTION_NAMES
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.estimate import EstimateStage, Problem, View, unknowns_of
+from leafflow_ti.stages.estimate import EstimateStage, OwnFlows, Problem, View, unknowns_of
 from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, TensorStage
 from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
 
@@ -32,8 +32,18 @@ CASES = [
     if (row.cameras == "reference") == (grid == "single")
     if model != "affine-5d" or grid == "square"
     if row.time or brightness != "temporal"
+    if not row.own_flows
 ]
-"""Every model with every brightness model and every grid that it exists for."""
+"""Every tensor with every brightness model and every grid that it exists for."""
+
+OWN_FLOW_CASES = [
+    (model, brightness, grid)
+    for model, row in MODELS.items()
+    if row.own_flows
+    for brightness in BRIGHTNESS
+    for grid in ("line-x", "line-y", "square")
+]
+"""The models that fit every camera's own flow, too."""
 
 PRESHIFT = (-8.3, 4.8)
 """Disparity [px/step] that the rendered blocks no longer hold: integer preshift and fractional offset together."""
@@ -144,6 +154,7 @@ class Bench:
     band: Band
     model: str = ""
     valid: np.ndarray | None = None  # [t, y, x]
+    brightness: str = "none"
 
     @cached_property
     def layout(self) -> TensorLayout:
@@ -156,6 +167,47 @@ class Bench:
         found = [stage.push(block, ok) for block, ok in zip(self.images, valid, strict=True)]
         assert all(tensor is None for tensor in found[:-1])
         return stage, found[-1]
+
+    @cached_property
+    def own_columns(self) -> tuple[Sampling, ColumnSet]:
+        """Sampling and data vector of one camera's own flow."""
+        sampling = Sampling(self.sampling.x, self.sampling.y, t=self.sampling.t)
+        return sampling, column_set(OWN_FLOW, self.brightness, (), sampling.sampled)
+
+    @cached_property
+    def steps(self) -> tuple[tuple[int, int], ...]:
+        """Every camera but the reference of ``affine-scene-flow``, as (x, y) steps from it."""
+        rows, cols = self.images.shape[1:3]
+        steps = [(i - cols // 2, j - rows // 2) for j in range(rows) for i in range(cols)]
+        return tuple(s for s in steps if s != (0, 0) or not MODELS[self.model].reference_rows)
+
+    @cached_property
+    def _own_tensors(self) -> list[Any]:
+        sampling, columns = self.own_columns
+        found = []
+        for x, y in self.steps:
+            stage = TensorStage(self.device, columns, TensorLayout.of(columns), sampling, self.band)
+            images = self.own_images(x, y)
+            found.append([stage.push(block, np.ones(block.shape[2:], bool)) for block in images][-1])
+        return found
+
+    def own_images(self, x: int, y: int) -> np.ndarray:
+        """Images [t, 1, 1, y, x] of the camera at a step from the reference."""
+        rows, cols = self.images.shape[1:3]
+        return self.images[:, y + rows // 2, x + cols // 2][:, None, None]
+
+    @functools.cache  # noqa: B019 - a bench lives as long as the session
+    def own_reference(self, row: int, col: int) -> list[tuple[np.ndarray, float]]:
+        """J and ρ of every camera's own flow at one output pixel by the naive twin."""
+        at = self.position(row, col)
+        sampling, columns = self.own_columns
+        return [
+            (
+                chain.structure_tensor(self.own_images(*step), sampling, columns, [at])[0],
+                chain.texture_smoothness(self.own_images(*step), sampling, *at),
+            )
+            for step in self.steps
+        ]
 
     @cached_property
     def planes(self) -> np.ndarray:
@@ -201,12 +253,20 @@ class Bench:
         """Run the per-pixel stages; ``motion`` None: without the motion fit."""
         from leafflow_ti.kernels.workspace import Region
 
+        tensors: list[Any] = []
         if motion is not None:
-            offsets, use_range = parse_rows(rows, self.model, motion, self.columns)
-            options |= {"offsets": offsets, "use_range": use_range, "unknowns": unknowns_of(motion, self.columns)}
+            model = MODELS[self.model]
+            offsets, use_range = parse_rows(rows if model.reference_rows else "2d", self.model, motion, self.columns)
+            options |= {"offsets": offsets, "use_range": use_range, "fitted": unknowns_of(motion, self.columns)}
+            if model.own_flows:
+                sampling, columns = self.own_columns
+                own = tuple(o for o in offsets if columns.index("x", o) is not None) if model.reference_rows else ("1",)
+                unknowns = {"translation": 3, "rotation": 6, "acceleration": 9}[motion]
+                options["own_flows"] = OwnFlows(columns, sampling, self.steps, own, unknowns, model.reference_rows)
+                tensors = self._own_tensors
         problem = Problem(self.columns, self.sampling, **options)
         stage = EstimateStage(self.device, problem, self.layout, self.view)
-        planes = np.array(stage(self._tensor[1]))
+        planes = np.array(stage(self._tensor[1], tensors))
         k, flow = self.columns.n_time_like, self.columns.n_flow
         parameters = self._region(stage, Region.PARAMETERS, k * flow)
         variance = self._region(stage, Region.VARIANCE, k)
@@ -262,7 +322,7 @@ def bench(device: Callable[[str], Device]) -> MakeBench:
         if not MODELS[model].time:
             images = images[SCENE.n_frames // 2][None]
         columns = column_set(MODELS[model], brightness, sampling.camera_axes, sampling.sampled)
-        return Bench(device(precision), images, sampling, columns, band, model)
+        return Bench(device(precision), images, sampling, columns, band, model, brightness=brightness)
 
     return make
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from conftest import OWN_FLOW_CASES
 from reference import chain
 from tolerances import SOLVERS, tolerance
 
@@ -60,7 +61,8 @@ def assert_maps_equal(b, found) -> None:
     limit = tolerance(b.device)
     for pixel in PIXELS:
         assert found.status[pixel] == Status.OK
-        reference = chain.measure(*b.reference(*pixel), found.problem, b.view, *b.position(*pixel))
+        own = b.own_reference(*pixel) if found.problem.own_flows else ()
+        reference = chain.measure(*b.reference(*pixel), found.problem, b.view, *b.position(*pixel), own)
         for name, (value, std) in reference.items():
             map_value, map_std = (m[pixel] for m in found.map(name))
             assert abs(map_value - value) <= limit.maps * std, f"{name}: {map_value} is not {value} ± {std}"
@@ -85,13 +87,42 @@ def test_every_motion_and_choice_of_rows(
     assert_maps_equal(b, b.estimate(motion, rows, weighted=weighted))
 
 
+@pytest.mark.parametrize("weighted", [True, False], ids=["wls", "ls"])
+@pytest.mark.parametrize(("model", "brightness", "grid"), OWN_FLOW_CASES)
+def test_own_flows_equal_the_twin(
+    bench: Callable, model: str, brightness: str, grid: str, precision: str, weighted: bool
+) -> None:
+    b = bench(model, brightness, grid, precision)
+    assert_maps_equal(b, b.estimate(MODELS[model].motions[0], weighted=weighted))
+
+
+@pytest.mark.parametrize("grid", ["line-x", "line-y", "square"])
+@pytest.mark.parametrize(
+    ("motion", "rows"),
+    [
+        ("translation", "u+b5"), ("translation", "2d"), ("translation", "2d+b5"), ("rotation", "2d"),
+        ("rotation", "2d+b5"), ("acceleration", "2d+at"), ("acceleration", "auto"),
+    ],
+)  # fmt: skip
+def test_submodels_of_the_affine_scene_flow(bench: Callable, grid: str, motion: str, rows: str) -> None:
+    """Trans., Rot. and the full model, each stabilised or not, with and without acceleration (section 6.3)."""
+    b = bench("affine-scene-flow", "none", grid, "f64")
+    assert_maps_equal(b, b.estimate(motion, rows))
+
+
 @pytest.mark.parametrize("estimator", ["ols", "tls"])
 def test_maps_of_the_other_estimators(bench: Callable, precision: str, estimator: str) -> None:
     b = bench("affine-4d", "spatial", "line-x", precision)
     assert_maps_equal(b, b.estimate("rotation", estimator=estimator))
 
 
-@pytest.mark.parametrize(("model", "grid"), [("affine-4d", "line-x"), ("affine-4d", "line-y"), ("affine-5d", "square")])
+@pytest.mark.parametrize(
+    ("model", "grid"),
+    [
+        ("affine-4d", "line-x"), ("affine-4d", "line-y"), ("affine-5d", "square"), ("affine-scene-flow", "line-x"),
+        ("affine-scene-flow", "square"),
+    ],
+)  # fmt: skip
 def test_maps_lie_near_the_truth(bench: Callable, model: str, grid: str) -> None:
     """Twin and kernels share their formulas; the scene does not. Five standard errors, the windows being tiny."""
     b = bench(model, "none", grid, "f64")
@@ -103,7 +134,7 @@ def test_maps_lie_near_the_truth(bench: Callable, model: str, grid: str) -> None
         for i, axis in enumerate("xyz"):
             wanted[f"velocity_{axis}"] = exact["velocity"][y, x, i]
             wanted[f"rotation_{axis}"] = exact["omega"][i]
-        for i, axis in enumerate("xy"):
+        for i, axis in enumerate("xyz" if found.problem.own_flows else "xy"):
             wanted[f"acceleration_{axis}"] = exact["acceleration"][y, x, i]
         for name, value in wanted.items():
             map_value, map_std = (m[pixel] for m in found.map(name))

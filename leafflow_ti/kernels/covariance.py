@@ -95,6 +95,20 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                 at = response_at + (r * n_rows + c) * stride
                 for i in range(lanes):
                     ws[at + i] = unit
+        if number[Number.OWN_FLOW] == 1:
+            # The flow itself is moved to another pixel by its derivatives there.
+            offsets = number[Number.OFFSETS]
+            for k in range(2):
+                step = value[Value.CAMERA_STEP + k]
+                for c in range(2):
+                    column = number[Number.MOVE + 2 * c + k]
+                    at = response_at + (column * n_rows + c * offsets) * stride
+                    for i in range(lanes):
+                        shift = step * (
+                            ws[base + number[Region.GEOMETRY] * stride + i] * value[Value.BASELINE + k]
+                            - value[Value.SHIFT + k]
+                        )
+                        ws[at + i] += value[Value.SCALE + column] * shift
         small.cholesky(ws, clean, flow, floor, stride)
         small.solve(ws, clean, response_at, flow, n_rows, stride)
         small.symmetric_times(ws, noise, response_at, product, flow, n_rows, stride)

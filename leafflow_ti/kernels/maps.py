@@ -2,6 +2,7 @@
 
 import functools
 from enum import IntEnum
+from types import SimpleNamespace
 
 from leafflow_ti.kernels.dense import tri
 from leafflow_ti.kernels.engine import ti
@@ -28,8 +29,8 @@ class Output(IntEnum):
 
 
 @functools.cache
-def maps_kernel(spec: KernelSpec):
-    """The stage that writes the output planes."""
+def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
+    """The stages that write the output planes: ``measured``, all but the motion, and ``motion``."""
     real, precise, lanes = spec.real, spec.precise, spec.lanes
     patch = patch_functions(spec)
     ok, no_structure, aperture, incoherent = (
@@ -91,12 +92,12 @@ def maps_kernel(spec: KernelSpec):
         return result
 
     @ti.func
-    def maps(
+    def measured(
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Write every plane of ``Output`` that the model has."""
-        flow, terms, n = number[Number.FLOW], number[Number.TERMS], number[Number.UNKNOWNS]
+        """Write the planes of status, geometry, flow and brightness that the model has."""
+        flow, terms = number[Number.FLOW], number[Number.TERMS]
         solution = number[Number.MOTION_SOLUTION]
         f = value[Value.F]
         for i in range(lanes):
@@ -131,10 +132,6 @@ def maps_kernel(spec: KernelSpec):
                             for m in ti.static(range(3)):
                                 variance += gradient[r] * ws[cov + (r * terms + m) * stride] * gradient[m]
                         put(out, Output.SLOPE_X + k, at, n_pixels, s[1 + k], variance)
-            for j in range(n):
-                q = base + (number[Region.MOTION] + j) * stride + i
-                cov = base + (number[Region.MOTION_COV] + j * n + j) * stride + i
-                put(out, Output.MOTION + j, at, n_pixels, ws[q], ws[cov])
             rows = base + number[Region.COV_T] * stride + i
             if solution >= 0:
                 for k in range(2):
@@ -150,4 +147,17 @@ def maps_kernel(spec: KernelSpec):
                         variance = ws[rows + tri(last, last) * stride]
                     put(out, Output.BRIGHTNESS + j, at, n_pixels, -ws[p], variance)
 
-    return batch_kernel(spec, maps)
+    @ti.func
+    def motion(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+    ):  # fmt: skip
+        """Write the planes of the motion."""
+        n = number[Number.UNKNOWNS]
+        for i in range(lanes):
+            for j in range(n):
+                q = base + (number[Region.MOTION] + j) * stride + i
+                cov = base + (number[Region.MOTION_COV] + j * n + j) * stride + i
+                put(out, Output.MOTION + j, pixel + i, n_pixels, ws[q], ws[cov])
+
+    return SimpleNamespace(measured=batch_kernel(spec, measured), motion=batch_kernel(spec, motion))

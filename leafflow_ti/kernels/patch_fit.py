@@ -1,7 +1,12 @@
-"""Motion of the surface patch: least squares of (N, Ω, A) from the motion rows and the range constraint.
+"""Motion of the surface patch: least squares of (N, Ω, A) from motion rows of one or of all cameras.
 
-Schuchert 2010, Eqs. (5.8), (5.18), (5.23) with the errata of the model contract: the time column uses ``∂X/∂t -
-N``, and preshifted data measure ``b a_s + nu0 a_x`` along a camera axis.
+Schuchert 2010, Eqs. (5.8), (5.18), (5.23), (6.15) with the errata of the model contract: the time column uses
+``∂X/∂t - N``, and preshifted data measure ``b a_s + nu0 a_x`` along a camera axis. The window's affine fit sees the
+mean of what it leaves out: on a plane the flow is quadratic in x, y, and its second-order part times the window's
+second moment belongs to the row of the flow itself.
+
+A set of rows (the reference model's, or one camera's own flow) is added to sums from which the motion is solved at the
+end, so the number of cameras does not matter to memory.
 """
 
 import functools
@@ -12,10 +17,14 @@ from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value, batch_kernel
 
+START, CLEAR, FINISH = 1, 2, 4
+"""What a launch does besides adding its rows: forget the motion, forget the sums (both before), solve (after)."""
+RANGE_CODE = 6
+
 
 @functools.cache
 def patch_functions(spec: KernelSpec) -> SimpleNamespace:
-    """Formulas of one patch, for one pixel: ``pixel_ray``, ``surface`` and ``motion_row``."""
+    """Formulas of one patch, for one pixel: ``pixel_ray``, ``surface``, ``motion_row`` and ``range_row``."""
     precise = spec.precise
     vec3 = ti.types.vector(3, precise)
     vec9 = ti.types.vector(MAX_UNKNOWNS, precise)
@@ -84,14 +93,23 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
     def motion_row(
         k: ti.i32, code: ti.i32, ray: ti.template(), s: ti.template(), N: ti.template(), value: ti.template()
     ):
-        """The row as the preshifted data measure it, per camera step along s."""
+        """The row as the window and the preshifted data measure it, per camera step along s."""
+        f = value[Value.F]
         along_s = code == 3 or code == 4
         row = vec9(0)
         for part in range(ti.select(along_s, 2, 1)):
             factor = precise(1.0)
             if along_s:
                 factor = value[ti.select(part == 0, Value.BASELINE, Value.SHIFT) + code - 3]
-            row += factor * bare_row(k, ti.select(part == 0, code, code - 2), ray, value[Value.F], s, N)
+            row += factor * bare_row(k, ti.select(part == 0, code, code - 2), ray, f, s, N)
+        if code == 0:
+            # Half the second derivative of u_k along its own axis: -T_Z d(1/Z) + (Ω × e_Z)_k / f, where T = N - Ω × X0
+            # is the velocity that the patch's rigid motion has at the camera; along the other axis it vanishes.
+            moment = value[Value.SECOND_MOMENT + k]
+            bend = moment * s[1 + k] / (f * s[0] * s[3])
+            row[2] += bend
+            row[3] -= bend * s[0] * ray[1] + ti.select(k == 1, moment / f, precise(0.0))
+            row[4] += bend * s[0] * ray[0] + ti.select(k == 0, moment / f, precise(0.0))
         return row
 
     @ti.func
@@ -109,7 +127,10 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
 
 @functools.cache
 def patch_fit_kernel(spec: KernelSpec):
-    """The stage that solves for the motion and its covariance."""
+    """The stage that adds a set of rows to the sums, and solves for the motion and its covariance with the last one.
+
+    Its ``which`` is a sum of ``START``, ``CLEAR`` and ``FINISH``.
+    """
     precise, lanes = spec.precise, spec.lanes
     small, patch = dense(spec), patch_functions(spec)
 
@@ -131,8 +152,9 @@ def patch_fit_kernel(spec: KernelSpec):
     ):  # fmt: skip
         """Rows of the system, linearised about the present motion, their measured values, and their sensitivity.
 
-        The sensitivity is the derivative of the rows' residual by the geometry, by central differences: variant 0 of
-        the loop is the geometry itself, two more for each of its terms are displaced.
+        An own flow is measured at the reference's preshifted pixel and moved to where the patch point projects by the
+        flow's own derivatives. The sensitivity is the derivative of the rows' residual by the geometry, by central
+        differences: variant 0 of the loop is the geometry itself, two more for each of its terms are displaced.
         """
         flow, terms, offsets = number[Number.FLOW], number[Number.TERMS], number[Number.OFFSETS]
         target = base + number[Region.DESIGN] * stride
@@ -147,7 +169,10 @@ def patch_fit_kernel(spec: KernelSpec):
                 for i in range(lanes):
                     ws[derivative + (r * terms + term) * stride + i] = own
         for i in range(lanes):
-            ray = patch.pixel_ray(pixel + i, number, value)
+            seen = patch.pixel_ray(pixel + i, number, value)
+            ray = seen
+            for k in ti.static(range(2)):
+                ray[k] += ws[g + i] * value[Value.BASELINE + k] * value[Value.CAMERA_STEP + k] / value[Value.F]
             motion = ti.Vector.zero(precise, MAX_UNKNOWNS)
             for j in ti.static(range(MAX_UNKNOWNS)):
                 motion[j] = ws[q + j * stride + i]
@@ -164,7 +189,8 @@ def patch_fit_kernel(spec: KernelSpec):
                     b[1] = ws[g + 2 * stride + i] + ti.select(term == 2, h, precise(0.0))
                 if variant > 0 and term == 0:
                     nu += h
-                s = patch.surface(ray, value[Value.F], nu, b[0], b[1])
+                s = patch.surface(seen, value[Value.F], nu, b[0], b[1])
+                s[3] = 1 - s[1] * ray[0] - s[2] * ray[1]
                 for r in range(n_rows):
                     row = any_row(r, ray, s, N, number, value)
                     if variant == 0:
@@ -176,105 +202,236 @@ def patch_fit_kernel(spec: KernelSpec):
                 at = g + number[Number.RANGE_TERM] * stride
                 if r < 2 * offsets:
                     at = parameters + number[Number.MOTION_ROWS + r] * stride
-                ws[measured + r * stride + i] = ws[at + i]
+                found = ws[at + i]
+                if number[Number.OWN_FLOW] == 1 and r % offsets == 0:
+                    for k in range(2):
+                        column = number[Number.MOVE + 2 * (r // offsets) + k]
+                        found += own_shift(k, ws[g + i], value) * ws[parameters + column * stride + i]
+                ws[measured + r * stride + i] = found
+
+    @ti.func
+    def own_shift(k: ti.i32, nu: precise, value: ti.template()):
+        """Pixels from the preshifted pixel to where the patch point projects into an own flow's camera."""
+        return value[Value.CAMERA_STEP + k] * (nu * value[Value.BASELINE + k] - value[Value.SHIFT + k])
 
     @ti.func
     def row_spread(
         base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
     ):
-        """Covariance of the rows: for the weights without, for the error bars with what motion and geometry share."""
-        terms, rows_t, used = number[Number.TERMS], number[Number.ROWS_T], 2 * number[Number.OFFSETS]
+        """OWN: noise of the rows and what their equations leave out; FACTOR: that and the geometry's noise in them.
+
+        What an equation leaves out is a share of the sizes of its terms.
+        """
+        terms, offsets = number[Number.TERMS], number[Number.OFFSETS]
         cov_t = base + number[Region.COV_T] * stride
         cov_g = base + number[Region.GEOMETRY_COV] * stride
-        cross = base + number[Region.GEOMETRY_CROSS] * stride
         d = base + number[Region.DERIVATIVE] * stride
+        a = base + number[Region.DESIGN] * stride
+        q = base + number[Region.MOTION] * stride
         for r in range(n_rows):
             for c in range(r + 1):
                 spread = ti.Vector.zero(precise, lanes)
-                shared = ti.Vector.zero(precise, lanes)
-                if r < used:
+                if r < 2 * offsets:
                     own = cov_t + tri(r, c) * stride
                     for i in range(lanes):
                         spread[i] = ws[own + i]
-                for a in range(terms):
-                    da = d + (r * terms + a) * stride
-                    db = d + (c * terms + a) * stride
-                    for b in range(terms):
-                        dc = d + (c * terms + b) * stride
-                        own = cov_g + (a * terms + b) * stride
+                if r == c:
+                    code = RANGE_CODE
+                    if r < 2 * offsets:
+                        code = number[Number.OFFSET_CODES + r % offsets]
+                    size = ti.Vector.zero(precise, lanes)
+                    for j in range(MAX_UNKNOWNS):
+                        one = a + (r * MAX_UNKNOWNS + j) * stride
+                        two = q + j * stride
+                        for i in range(lanes):
+                            size[i] += ti.abs(ws[one + i] * ws[two + i])
+                    share = value[Value.MODEL_ERROR + code]
+                    for i in range(lanes):
+                        spread[i] += share * share * size[i] * size[i]
+                small.store(ws, base + (number[Region.OWN] + tri(r, c)) * stride, spread)
+                for one in range(terms):
+                    da = d + (r * terms + one) * stride
+                    for two in range(terms):
+                        dc = d + (c * terms + two) * stride
+                        own = cov_g + (one * terms + two) * stride
                         for i in range(lanes):
                             spread[i] += ws[da + i] * ws[own + i] * ws[dc + i]
-                    if c < used:
-                        own = cross + (a * rows_t + c) * stride
-                        for i in range(lanes):
-                            shared[i] += ws[da + i] * ws[own + i]
-                    if r < used:
-                        own = cross + (a * rows_t + r) * stride
-                        for i in range(lanes):
-                            shared[i] += ws[db + i] * ws[own + i]
-                for i in range(lanes):
-                    shared[i] += spread[i]
-                small.store(ws, base + (number[Region.TOTAL] + tri(r, c)) * stride, shared)
-                caution = precise(1.0)
-                if r == used:
-                    caution = value[Value.RANGE_CAUTION] * ti.select(
-                        c == used, value[Value.RANGE_CAUTION], precise(1.0)
-                    )
-                for i in range(lanes):
-                    spread[i] *= caution
-                small.store(ws, base + (number[Region.SPREAD] + tri(r, c)) * stride, spread)
+                small.store(ws, base + (number[Region.FACTOR] + tri(r, c)) * stride, spread)
 
     @ti.func
-    def solve(base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()):
-        """Weighted normal equations; WEIGHTED becomes ``W A``, NORMAL the factor of ``A^T W A``."""
+    def leave_out(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, n_rows: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """Rows of an own flow whose window has left the image or that follows nothing get zero values and design."""
+        mass = number[Number.EXTRA] * n_pixels + pixel
+        p = base + number[Region.PARAMETERS] * stride
+        used = ti.Vector.zero(precise, lanes)
+        for i in range(lanes):
+            shift = precise(0.0)
+            for k in ti.static(range(2)):
+                shift += ws[p + number[Number.FLOW_ROWS + k] * stride + i] ** 2
+            good = shift < value[Value.MAX_SHIFT] ** 2 and ti.cast(J[mass + i], precise) > value[Value.MIN_MASS]
+            used[i] = ti.cast(good, precise)
+        for r in range(n_rows):
+            for c in range(r + 1):
+                # Also where the covariance is no number: a unit matrix in its place.
+                for region in range(2):
+                    at = base + (number[ti.select(region == 0, Region.OWN, Region.FACTOR)] + tri(r, c)) * stride
+                    element = ti.Vector.zero(precise, lanes)
+                    for i in range(lanes):
+                        element[i] = ti.select(used[i] > 0, ws[at + i], ti.cast(r == c, precise))
+                    small.store(ws, at, element)
+            for j in range(MAX_UNKNOWNS + 1):
+                at = base + (number[Region.DESIGN] + r * MAX_UNKNOWNS + j) * stride
+                if j == MAX_UNKNOWNS:
+                    at = base + (number[Region.VALUE] + r) * stride
+                element = ti.Vector.zero(precise, lanes)
+                for i in range(lanes):
+                    element[i] = ti.select(used[i] > 0, ws[at + i], precise(0.0))
+                small.store(ws, at, element)
+
+    @ti.func
+    def weigh(base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()):
+        """WEIGHTED becomes ``W A``, with plain least squares A itself."""
         n = number[Number.UNKNOWNS]
-        a = base + number[Region.DESIGN] * stride
-        v = base + number[Region.VALUE] * stride
         factor = base + number[Region.FACTOR] * stride
         weighted = base + number[Region.WEIGHTED] * stride
-        normal = base + number[Region.NORMAL] * stride
-        q = base + number[Region.MOTION] * stride
         for r in range(n_rows):
-            for c in range(n):
-                small.copy(ws, a + (r * MAX_UNKNOWNS + c) * stride, weighted + (r * n + c) * stride, 1, stride)
+            a = base + (number[Region.DESIGN] + r * MAX_UNKNOWNS) * stride
+            small.copy(ws, a, weighted + r * n * stride, n, stride)
         if number[Number.WEIGHTED] == 1:
-            small.copy(ws, base + number[Region.SPREAD] * stride, factor, n_rows * (n_rows + 1) // 2, stride)
             small.cholesky(ws, factor, n_rows, -1, stride)
             small.solve(ws, factor, weighted, n_rows, n, stride)
+
+    @ti.func
+    def add(ws: ti.template(), at: ti.i32, term: ti.template()):
+        """Add a vector over the lanes to one element."""
+        total = ti.Vector.zero(precise, lanes)
+        for i in range(lanes):
+            total[i] = ws[at + i] + term[i]
+        small.store(ws, at, total)
+
+    @ti.func
+    def accumulate(base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()):
+        """Add the rows to the normal equations and to what their covariance is made of."""
+        n, terms = number[Number.UNKNOWNS], number[Number.TERMS]
+        weighted = base + number[Region.WEIGHTED] * stride
+        work = base + number[Region.MOTION_WORK] * stride
+        small.symmetric_times(ws, base + number[Region.OWN] * stride, weighted, work, n_rows, n, stride)
+        for part in range(4):
+            x, step, rows, target = number[Region.DESIGN], MAX_UNKNOWNS, n, number[Region.NORMAL]
+            if part == 1:
+                x, step, rows, target = number[Region.MOTION_WORK], n, n, number[Region.NORMAL_SPREAD]
+            elif part == 2:
+                x, step, rows, target = number[Region.DERIVATIVE], terms, terms, number[Region.LEFT]
+            elif part == 3:
+                x, step, rows, target = number[Region.VALUE], 1, 1, number[Region.NORMAL_RHS]
+            for r in range(rows):
+                for c in range(n):
+                    one = base + (x + r) * stride
+                    element = small.dot(ws, one, step, weighted + c * stride, n, n_rows, stride)
+                    add(ws, base + (target + r * n + c) * stride, element)
+
+    @ti.func
+    def correlate(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """What the reference's rows share with the geometry, and an own flow's with the reference's rows."""
+        n, terms, rows_t = number[Number.UNKNOWNS], number[Number.TERMS], number[Number.ROWS_T]
+        used = 2 * number[Number.OFFSETS]
+        weighted = base + number[Region.WEIGHTED] * stride
+        kept = base + number[Region.REFERENCE_VARIANCE] * stride
+        variance = base + (number[Region.VARIANCE] + number[Number.MOTION_SOLUTION]) * stride
+        if number[Number.OWN_FLOW] == 0:
+            small.copy(ws, variance, kept, 1, stride)
+            for c in range(n):
+                for a in range(terms + number[Number.CORRELATED]):
+                    # Geometry times motion rows, then the response of the motion rows to the normal equations.
+                    x = base + (number[Region.GEOMETRY_CROSS] + a * rows_t) * stride
+                    at = base + (number[Region.RIGHT] + a * n + c) * stride
+                    if a >= terms:
+                        x = base + (number[Region.RESPONSE_T] + (a - terms) * rows_t) * stride
+                        at = base + (number[Region.LEFT] + a * n + c) * stride
+                    add(ws, at, small.dot(ws, x, 1, weighted + c * stride, n, used, stride))
+        else:
+            factor = ti.Vector.zero(precise, lanes)
+            energy = (number[Number.EXTRA] + 1) * n_pixels + pixel
+            for i in range(lanes):
+                plain = ti.cast(J[energy + i], precise)
+                smooth = ti.cast(J[energy + n_pixels + i], precise)
+                rho = ti.select(plain > 0, ti.min(smooth / plain, precise(1.0)), precise(1.0))
+                common = ws[kept + i] * ws[variance + i]
+                factor[i] = ti.select(common > 0, rho * ti.sqrt(common), precise(0.0))
+            for a in range(number[Number.CORRELATED]):
+                partner = number[Number.PARTNER + a]
+                if partner >= 0:
+                    x = base + (number[Region.PRODUCT] + partner * rows_t) * stride
+                    for c in range(n):
+                        term = small.dot(ws, x, 1, weighted + c * stride, n, used, stride)
+                        for i in range(lanes):
+                            term[i] *= factor[i] * value[Value.PARTNER + a]
+                        add(ws, base + (number[Region.RIGHT] + (terms + a) * n + c) * stride, term)
+
+    @ti.func
+    def finish(base: ti.i32, stride: ti.i32, number: ti.template(), ws: ti.template()):
+        """Motion and covariance from the sums."""
+        n, terms = number[Number.UNKNOWNS], number[Number.TERMS]
+        normal = base + number[Region.MOTION_WORK] * stride
+        q = base + number[Region.MOTION] * stride
+        cov = base + number[Region.MOTION_COV] * stride
+        left = base + number[Region.LEFT] * stride
+        right = base + number[Region.RIGHT] * stride
+        small.copy(ws, base + number[Region.NORMAL_RHS] * stride, q, n, stride)
         for r in range(n):
-            for c in range(r + 1):
-                element = small.dot(ws, a + r * stride, MAX_UNKNOWNS, weighted + c * stride, n, n_rows, stride)
-                small.store(ws, normal + tri(r, c) * stride, element)
-            small.store(ws, q + r * stride, small.dot(ws, weighted + r * stride, n, v, 1, n_rows, stride))
+            small.copy(ws, base + (number[Region.NORMAL] + r * n) * stride, normal + tri(r, 0) * stride, r + 1, stride)
         small.cholesky(ws, normal, n, -1, stride)
         small.solve(ws, normal, q, n, 1, stride)
+        for a in range(terms):
+            # LEFT^T cov LEFT as two transposed halves.
+            x = base + (number[Region.GEOMETRY_COV] + a * terms) * stride
+            for c in range(n):
+                half = small.dot(ws, x, 1, left + c * stride, n, terms, stride)
+                for i in range(lanes):
+                    half[i] *= precise(0.5)
+                add(ws, right + (a * n + c) * stride, half)
+        count = terms + number[Number.CORRELATED]
+        for r in range(n):
+            for c in range(n):
+                element = ti.Vector.zero(precise, lanes)
+                own = base + (number[Region.NORMAL_SPREAD] + r * n + c) * stride
+                for i in range(lanes):
+                    element[i] = ws[own + i]
+                for side in range(2):
+                    one = ti.select(side == 0, r, c)
+                    two = ti.select(side == 0, c, r)
+                    part = small.dot(ws, left + one * stride, n, right + two * stride, n, count, stride)
+                    for i in range(lanes):
+                        element[i] += part[i]
+                small.store(ws, cov + (r * n + c) * stride, element)
+        small.sandwich(ws, normal, cov, n, 2, stride)
 
     @ti.func
     def patch_fit(
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Motion and covariance; each pass takes Ω × N and the rows' covariance from the one before."""
-        n = number[Number.UNKNOWNS]
+        """Add the rows of one set; Ω × N and the geometry's noise in the rows are taken at the present motion."""
         n_rows = 2 * number[Number.OFFSETS] + number[Number.USE_RANGE]
-        q = base + number[Region.MOTION] * stride
-        for j in range(MAX_UNKNOWNS):
-            for i in range(lanes):
-                ws[q + j * stride + i] = precise(0.0)
-        for _ in range(number[Number.PASSES]):
-            design(base, pixel, stride, n_rows, number, value, ws)
-            row_spread(base, stride, n_rows, number, value, ws)
-            solve(base, stride, n_rows, number, ws)
-        weighted = base + number[Region.WEIGHTED] * stride
-        total = base + number[Region.TOTAL] * stride
-        work = base + number[Region.MOTION_WORK] * stride
-        normal = base + number[Region.NORMAL] * stride
-        cov = base + number[Region.MOTION_COV] * stride
-        small.symmetric_times(ws, total, weighted, work, n_rows, n, stride)
-        for r in range(n):
-            for c in range(n):
-                element = small.dot(ws, weighted + r * stride, n, work + c * stride, n, n_rows, stride)
-                small.store(ws, cov + (r * n + c) * stride, element)
-        small.sandwich(ws, normal, cov, n, 2, stride)
+        first = ti.select(which & START, number[Region.MOTION], number[Region.NORMAL])
+        if which & (START | CLEAR) != 0:
+            for e in range(number[Region.REFERENCE_VARIANCE] - first):
+                for i in range(lanes):
+                    ws[base + (first + e) * stride + i] = precise(0.0)
+        design(base, pixel, stride, n_rows, number, value, ws)
+        row_spread(base, stride, n_rows, number, value, ws)
+        if number[Number.OWN_FLOW] == 1:
+            leave_out(base, pixel, stride, n_pixels, n_rows, number, value, J, ws)
+        weigh(base, stride, n_rows, number, ws)
+        accumulate(base, stride, n_rows, number, ws)
+        correlate(base, pixel, stride, n_pixels, number, value, J, ws)
+        if which & FINISH != 0:
+            finish(base, stride, number, ws)
 
     return batch_kernel(spec, patch_fit)

@@ -57,18 +57,25 @@ class Region(IntEnum):
     MOTION_COV = auto()  # [9, 9]
     DESIGN = auto()  # [M, 9]
     VALUE = auto()  # [M]
-    WEIGHTED = auto()  # [M, 10]
-    SPREAD = auto()  # packed [M]
-    FACTOR = auto()  # packed [M]
-    TOTAL = auto()  # packed [M]
+    WEIGHTED = auto()  # [M, 9]: weights times design
+    OWN = auto()  # packed [M]: covariance of the rows without what they owe to the geometry
+    FACTOR = auto()  # packed [M]: of the weights' inverse
     DERIVATIVE = auto()  # [M, G]
-    NORMAL = auto()  # packed [9]
-    MOTION_WORK = auto()  # [M, 9]
+    MOTION_WORK = auto()  # [M, 9], packed [9]
+    NORMAL = auto()  # [9, 9]; from here on: sums over the sets of rows of the motion fit
+    NORMAL_RHS = auto()  # [9]
+    NORMAL_SPREAD = auto()  # [9, 9]
+    LEFT = auto()  # [G + F, 9]: by the errors of the geometry, of the reference's normal equations
+    RIGHT = auto()  # [G + F, 9]: what is correlated with them
+    REFERENCE_VARIANCE = auto()  # [1]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Offsets of the regions, in elements, for a model with ``n`` columns and ``k`` solutions."""
+    """Offsets of the regions, in elements, for a model with ``n`` columns and ``k`` solutions.
+
+    ``rows_t`` and ``motion``: the largest numbers of motion rows and of equations of any camera.
+    """
 
     n: int
     k: int
@@ -120,13 +127,17 @@ class Layout:
             Region.MOTION_COV: MAX_UNKNOWNS * MAX_UNKNOWNS,
             Region.DESIGN: motion * MAX_UNKNOWNS,
             Region.VALUE: motion,
-            Region.WEIGHTED: motion * (MAX_UNKNOWNS + 1),
-            Region.SPREAD: packed(motion),
+            Region.WEIGHTED: motion * MAX_UNKNOWNS,
+            Region.OWN: packed(motion),
             Region.FACTOR: packed(motion),
-            Region.TOTAL: packed(motion),
             Region.DERIVATIVE: motion * terms,
-            Region.NORMAL: packed(MAX_UNKNOWNS),
-            Region.MOTION_WORK: motion * MAX_UNKNOWNS,
+            Region.MOTION_WORK: max(motion * MAX_UNKNOWNS, packed(MAX_UNKNOWNS)),
+            Region.NORMAL: MAX_UNKNOWNS * MAX_UNKNOWNS,
+            Region.NORMAL_RHS: MAX_UNKNOWNS,
+            Region.NORMAL_SPREAD: MAX_UNKNOWNS * MAX_UNKNOWNS,
+            Region.LEFT: (terms + flow) * MAX_UNKNOWNS,
+            Region.RIGHT: (terms + flow) * MAX_UNKNOWNS,
+            Region.REFERENCE_VARIANCE: 1,
         }
 
     @property
@@ -156,7 +167,8 @@ class Number(IntEnum):
     USE_RANGE = auto()
     UNKNOWNS = auto()  # of the motion fit; 0 without one
     WEIGHTED = auto()  # weighted least squares, else plain
-    PASSES = auto()  # of the motion fit
+    OWN_FLOW = auto()  # the tables of one camera's own flow, not of the reference model
+    CORRELATED = auto()  # columns of the reference model whose noise other cameras share; 0 without them
     BRIGHTNESS_COLUMN = auto()  # column of I, or -1
     CROSS_TERMS = auto()  # per pair (camera solution, motion)
     RANGE_TERM = auto()  # index of t among the geometry terms
@@ -172,7 +184,9 @@ class Number(IntEnum):
     CAMERA_ROWS = MOTION_ROWS + MAX_ROWS  # 2 x MAX_ROWS: columns of the geometry rows per camera solution
     CAMERA_AXIS = CAMERA_ROWS + 2 * MAX_ROWS  # 2: 0 for sx, 1 for sy
     CROSS_AB = CAMERA_AXIS + 2  # 2 x 9 x 3: a, b, plane of J
-    LOWER = CROSS_AB + 54  # N (N + 1) / 2: plane of each element of the lower triangle
+    MOVE = CROSS_AB + 54  # 2 x 2: columns of the flow's derivatives along x, y
+    PARTNER = MOVE + 4  # MAX_COLUMNS: column of an own flow for each column of the reference model, or -1
+    LOWER = PARTNER + MAX_COLUMNS  # N (N + 1) / 2: plane of each element of the lower triangle
 
 
 class Value(IntEnum):
@@ -186,8 +200,10 @@ class Value(IntEnum):
     SHIFT = BASELINE + 2  # 2: disparity that the preshift and the rectification took out, px per step
     STEP_SIZE = SHIFT + 2  # relative step of the finite differences in the motion fit
     DENOISE = auto()  # share of the gradients' noise that is taken out of J_ff in the covariances
-    RANGE_CAUTION = auto()  # factor of the standard error of b_t in the weights
-    GAIN = auto()  # noise gain of the gradient: x and y
+    MODEL_ERROR = auto()  # 7: relative, per offset code of a row, the last one of the range constraint
+    SECOND_MOMENT = MODEL_ERROR + 7  # 2: of the window along x, y, px²
+    CAMERA_STEP = SECOND_MOMENT + 2  # 2: steps of an own flow's camera from the reference
+    GAIN = CAMERA_STEP + 2  # noise gain of the gradient: x and y
     MIN_MASS = auto()
     MIN_STRUCTURE = auto()  # least gradient energy per energy of the image
     ROUGHEST = auto()  # share of the gradient's energy that one more smoothing leaves, below which it is noise
@@ -197,7 +213,8 @@ class Value(IntEnum):
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9
-    RATIO = CROSS + 18  # k x packed [F]
+    PARTNER = CROSS + 18  # MAX_COLUMNS: factor of the noise shared with each column of the reference model
+    RATIO = PARTNER + MAX_COLUMNS  # k x packed [F]
 
 
 @functools.cache

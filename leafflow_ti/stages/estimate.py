@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,15 @@ from numpy.typing import NDArray
 
 from leafflow_ti.models import AXES, Column, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_gain, noise_ratio, white_smoothness
+from leafflow_ti.sampling import (
+    Sampling,
+    column_noise,
+    cross_noise,
+    noise_gain,
+    noise_ratio,
+    shared_noise,
+    white_smoothness,
+)
 from leafflow_ti.stages.estimators import ESTIMATORS
 
 BATCH_BYTES = 8 << 20
@@ -26,12 +35,12 @@ residual of raw TLS is no bound for the eigenvalues of the equilibrated tensor.
 What noise adds to J_ff is no structure. Taking nearly all of it leaves the matrix definite where there is nothing else,
 and makes the standard errors there ten times larger.
 """
-RANGE_CAUTION = 3.0
-"""Factor of the standard error of b_t in the weights of the motion fit.
+MODEL_ERROR = {"1": 0.0, "x": 0.05, "y": 0.05, "sx": 0.07, "sy": 0.07, "t": 0.05, "range": 0.07}
+"""What each equation of the motion fit leaves out, as a share of the sizes of its terms; by the offset of its row.
 
-The range constraint suffers most from what the affine model leaves out (on a turning 60° face it is off by 2.6 %
-without any noise), and ``a_s`` measures the same mixed derivative from the same noise: its own error alone would
-overrate it.
+Noise is not all: on steep and turning surfaces the affine model's derivatives are off by some per cent without any
+(the mixed ones, ``a_s`` and ``b_t``, most: 1-3 % on a turning 60° face), while the flow itself is not. Weights that
+know of the noise alone stake everything on the derivatives where images are good.
 """
 STEP_SIZE = {"f64": 1e-4, "f32": 1e-2}
 MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
@@ -43,10 +52,27 @@ MAX_RESIDUAL_PX = 0.5
 
 
 @dataclass(frozen=True)
+class OwnFlows:
+    """The flows of single cameras in the motion fit (6.15): their data vector, and where the cameras stand.
+
+    ``steps``: (x, y) steps of each camera from the reference. ``offsets``: of their rows. ``unknowns`` of the fit.
+    ``reference_rows``: the rows of the reference model take part, too.
+    """
+
+    columns: ColumnSet
+    sampling: Sampling
+    steps: tuple[tuple[int, int], ...]
+    offsets: tuple[str, ...]
+    unknowns: int
+    reference_rows: bool
+
+
+@dataclass(frozen=True)
 class Problem:
     """What is estimated: columns, geometry terms, motion rows; independent of band and device.
 
-    ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``unknowns`` of the motion fit (0: none).
+    ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``fitted``: unknowns of the motion fit to the
+    reference's rows (0: none), from which a fit with ``own_flows`` starts.
     """
 
     columns: ColumnSet
@@ -56,9 +82,15 @@ class Problem:
     weighted: bool = True
     offsets: tuple[str, ...] = ("1",)
     use_range: bool = False
-    unknowns: int = 0
+    fitted: int = 0
+    own_flows: OwnFlows | None = None
     passes: int = 3
     iterations: int = 4
+
+    @property
+    def unknowns(self) -> int:
+        """Components of (N, Ω, A) that are measured."""
+        return self.own_flows.unknowns if self.own_flows else self.fitted
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -100,24 +132,42 @@ class View:
     pitch: int
 
 
+@dataclass
+class _Tables:
+    """The tables of one data vector, on the host and on the device, and the tensor that belongs to them."""
+
+    number: NDArray[np.int32]
+    value: NDArray[np.float64]
+    on_device: tuple[Any, Any] = (None, None)
+    tensor: Any = None
+
+
 class EstimateStage:
-    """Maps of ``Output`` planes [rows, pitch] from the packed tensor of ``TensorStage``."""
+    """Maps of ``Output`` planes [rows, pitch] from the packed tensors of ``TensorStage``.
+
+    One tensor of the reference model, and one of each camera's own flow where the problem has them.
+    """
 
     def __init__(self, device: Device, problem: Problem, layout: TensorLayout, view: View):
-        from leafflow_ti.kernels.workspace import Layout, Number, Region, Value
+        from leafflow_ti.kernels.workspace import Layout
 
         self.device, self.problem, self.view = device, problem, view
-        columns = problem.columns
+        columns, own = problem.columns, problem.own_flows
         rows = self._rows()
+        n_rows = [2 * len(problem.offsets) + problem.use_range] + ([2 * len(own.offsets)] if own else [])
         self.layout = Layout(
-            columns.n, columns.n_time_like, len(rows.camera[0]) if rows.camera else 0, len(rows.motion),
-            len(problem.terms), 2 * len(problem.offsets) + problem.use_range,
+            columns.n, columns.n_time_like, len(rows.camera[0]) if rows.camera else 0, max(len(rows.motion), *n_rows),
+            len(problem.terms), max(n_rows),
         )  # fmt: skip
-        flow = columns.n_flow
-        self.numbers = np.full(Number.LOWER + len(layout.lower), -1, np.int32)
-        self.numbers[: len(Region)] = self.layout.offsets
-        self.values = np.zeros(Value.RATIO + columns.n_time_like * flow * (flow + 1) // 2)
-        self._fill_model(rows, layout)
+        self.reference = self._reference_tables(rows, layout)
+        self._all_tables = [self.reference]
+        if own:
+            # The same rows among all unknowns.
+            self._final = _Tables(self.reference.number.copy(), self.reference.value)
+            self._set_numbers(self._final.number, UNKNOWNS=own.unknowns, CORRELATED=columns.n_flow)
+            own_layout = TensorLayout.of(own.columns)
+            self._own = [self._own_tables(own, own_layout, step) for step in own.steps]
+            self._all_tables += [self._final, *self._own]
         self.set_view(view)
         lanes = device.dense.lanes
         n_pixels = view.rows * view.pitch
@@ -145,33 +195,35 @@ class EstimateStage:
             motion=motion, camera=[both("x" if a == "sx" else "y", problem.terms) for a in problem.camera_axes]
         )
 
-    def _fill_model(self, rows: SimpleNamespace, layout: TensorLayout) -> None:
-        from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Value
+    @staticmethod
+    def _set_numbers(number: NDArray[np.int32], **entries: int) -> None:
+        from leafflow_ti.kernels.workspace import Number
 
-        problem, columns, sampling = self.problem, self.problem.columns, self.problem.sampling
-        number, value = self.numbers, self.values
-        precision = self.device.algebra
-        number[Number.N], number[Number.SOLUTIONS], number[Number.FLOW] = columns.n, columns.n_time_like, columns.n_flow
-        number[Number.ITERATIONS] = problem.iterations
-        has_time = "t" in columns.solutions
-        number[Number.MOTION_SOLUTION] = columns.n_time_like - 1 if has_time else -1
-        number[Number.TERMS] = len(problem.terms)
-        number[Number.OFFSETS] = len(problem.offsets)
-        number[Number.ROWS_T] = len(rows.motion)
-        number[Number.ROWS_S] = len(rows.camera[0]) if rows.camera else 0
-        number[Number.USE_RANGE] = problem.use_range
-        number[Number.UNKNOWNS] = problem.unknowns
-        number[Number.WEIGHTED] = problem.weighted
-        number[Number.PASSES] = problem.passes
-        brightness = columns.index("i")
-        number[Number.BRIGHTNESS_COLUMN] = -1 if brightness is None else brightness
-        number[Number.RANGE_TERM] = problem.terms.index("t") if "t" in problem.terms else -1
-        number[Number.CAMERA_SOLUTIONS] = len(problem.camera_axes)
-        number[Number.EXTRA] = len(layout.entries)
+        for name, entry in entries.items():
+            number[Number[name]] = entry
+
+    def _tables(
+        self, columns: ColumnSet, sampling: Sampling, layout: TensorLayout, offsets: Sequence[str], rows: Sequence[int]
+    ) -> _Tables:
+        """What the tables of every data vector hold: columns, noise, the motion rows."""
+        from leafflow_ti.kernels.patch_fit import RANGE_CODE
+        from leafflow_ti.kernels.workspace import Number, Region, Value
+
+        problem, precision = self.problem, self.device.algebra
+        number = np.full(Number.LOWER + len(layout.lower), -1, np.int32)
+        value = np.zeros(Value.RATIO + columns.n_time_like * columns.n_flow * (columns.n_flow + 1) // 2)
+        number[: len(Region)] = self.layout.offsets
+        self._set_numbers(
+            number, N=columns.n, SOLUTIONS=columns.n_time_like, FLOW=columns.n_flow, ITERATIONS=problem.iterations,
+            MOTION_SOLUTION=columns.n_time_like - 1 if "t" in columns.solutions else -1, TERMS=len(problem.terms),
+            OFFSETS=len(offsets), ROWS_T=len(rows), ROWS_S=0, USE_RANGE=0, UNKNOWNS=0, WEIGHTED=problem.weighted,
+            BRIGHTNESS_COLUMN=-1, RANGE_TERM=-1, CAMERA_SOLUTIONS=0, CROSS_TERMS=0, OWN_FLOW=0, CORRELATED=0,
+            EXTRA=len(layout.entries),
+        )  # fmt: skip
         number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = [columns.columns.index(Column(c)) for c in ("x", "y")]
-        for i, o in enumerate(problem.offsets):
+        for i, o in enumerate(offsets):
             number[Number.OFFSET_CODES + i] = 0 if o == "1" else 1 + AXES.index(o)
-        number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows.motion)] = rows.motion
+        number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows)] = rows
         number[Number.LOWER :] = layout.lower
         noise = column_noise(sampling, columns)
         value[Value.RIDGE], value[Value.GAP], value[Value.STEP_SIZE] = (t[precision] for t in (RIDGE, GAP, STEP_SIZE))
@@ -181,46 +233,84 @@ class EstimateStage:
         value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
         value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
-        value[Value.RANGE_CAUTION] = RANGE_CAUTION
+        for code, name in enumerate(("1", *AXES, "range")):
+            value[Value.MODEL_ERROR + code] = MODEL_ERROR[name]
+        assert RANGE_CODE == len(AXES) + 1
+        value[Value.SECOND_MOMENT : Value.SECOND_MOMENT + 2] = sampling.x.moment(2), sampling.y.moment(2)
         # Windows that do not overlap from one frame to the next share no content that could be followed.
         value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size)
         value[Value.DENOISE] = DENOISE[problem.estimator]
         lower = np.tril_indices(columns.n_flow)
         ratios = [noise_ratio(sampling, columns, a)[lower] for a in columns.solutions]
         value[Value.RATIO :] = np.concatenate(ratios)
-        number[Number.CROSS_TERMS] = 0
+        return _Tables(number, value)
+
+    def _reference_tables(self, rows: SimpleNamespace, layout: TensorLayout) -> _Tables:
+        from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Value
+
+        problem, columns, sampling = self.problem, self.problem.columns, self.problem.sampling
+        tables = self._tables(columns, sampling, layout, problem.offsets, rows.motion)
+        number, value = tables.number, tables.value
+        brightness = columns.index("i")
+        self._set_numbers(
+            number, ROWS_S=len(rows.camera[0]) if rows.camera else 0, USE_RANGE=problem.use_range,
+            UNKNOWNS=problem.fitted, BRIGHTNESS_COLUMN=-1 if brightness is None else brightness,
+            RANGE_TERM=problem.terms.index("t") if "t" in problem.terms else -1,
+            CAMERA_SOLUTIONS=len(problem.camera_axes),
+        )  # fmt: skip
         for k, axis in enumerate(problem.camera_axes):
             number[Number.CAMERA_AXIS + k] = 0 if axis == "sx" else 1
             at = Number.CAMERA_ROWS + k * MAX_ROWS
             number[at : at + len(rows.camera[k])] = rows.camera[k]
-            terms = cross_noise(sampling, columns, axis, "t") if has_time else ()
+            terms = cross_noise(sampling, columns, axis, "t") if "t" in columns.solutions else ()
             number[Number.CROSS_TERMS] = len(terms)
             for j, term in enumerate(terms):
                 r, c = max(term.base_a, term.base_b), min(term.base_a, term.base_b)
                 at = Number.CROSS_AB + (k * 9 + j) * 3
                 number[at : at + 3] = term.a, term.b, layout.lower[r * (r + 1) // 2 + c]
                 value[Value.CROSS + k * 9 + j] = term.value
+        return tables
+
+    def _own_tables(self, own: OwnFlows, layout: TensorLayout, step: tuple[int, int]) -> _Tables:
+        """Tables of one camera's own flow; ``step``: where it stands."""
+        from leafflow_ti.kernels.workspace import Number, Value
+
+        found = [own.columns.index(c, o) for c in ("x", "y") for o in own.offsets]
+        tables = self._tables(own.columns, own.sampling, layout, own.offsets, [i for i in found if i is not None])
+        number, value = tables.number, tables.value
+        columns = self.problem.columns
+        self._set_numbers(number, OWN_FLOW=1, UNKNOWNS=own.unknowns, CORRELATED=columns.n_flow * own.reference_rows)
+        moves = [own.columns.index(c, o) for c in ("x", "y") for o in ("x", "y")]
+        number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
+        value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
+        for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
+            number[Number.PARTNER + a] = partner
+            if partner >= 0:
+                scales = self.reference.value[Value.SCALE + a], value[Value.SCALE + partner]
+                value[Value.PARTNER + a] = factor * scales[0] / scales[1]
+        return tables
 
     def set_view(self, view: View) -> None:
         """Move to another band of the same size."""
-        from leafflow_ti.kernels.workspace import Number, Value
+        from leafflow_ti.kernels.workspace import Value
 
         self.view = view
-        self.numbers[Number.OUT_X], self.numbers[Number.OUT_Y] = view.x, view.y
-        self.numbers[Number.STEP], self.numbers[Number.PITCH] = view.step, view.pitch
-        self.values[Value.F], self.values[Value.PX], self.values[Value.PY] = view.f_px, *view.principal_px
-        self.values[Value.BASELINE : Value.BASELINE + 2] = view.baseline_mm
-        self.values[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
-        self._number = self.device.array(self.numbers, "int")
-        self._value = self.device.array(self.values, "algebra")
+        for tables in self._all_tables:
+            self._set_numbers(tables.number, OUT_X=view.x, OUT_Y=view.y, STEP=view.step, PITCH=view.pitch)
+            value = tables.value
+            value[Value.F], value[Value.PX], value[Value.PY] = view.f_px, *view.principal_px
+            value[Value.BASELINE : Value.BASELINE + 2] = view.baseline_mm
+            value[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
+            tables.on_device = (self.device.array(tables.number, "int"), self.device.array(value, "algebra"))
 
-    def unscaled(self) -> Any:
+    @staticmethod
+    def unscaled(value: NDArray[np.float64]) -> NDArray[np.float64]:
         """The table ``value`` with unit scales: the tensor in raw units."""
         from leafflow_ti.kernels.workspace import MAX_COLUMNS, Value
 
-        raw = self.values.copy()
+        raw = value.copy()
         raw[Value.SCALE : Value.SCALE + MAX_COLUMNS] = 1.0
-        return self.device.array(raw, "algebra")
+        return raw
 
     def unsolved(self) -> bool:
         """Whether pixels of the present batch have no null space yet; on a GPU always, a look would cost more."""
@@ -232,42 +322,65 @@ class EstimateStage:
         solved = self._workspace.reshape(shape)[: self._batch_groups, self.layout.offsets[Region.CONVERGED]]
         return bool((solved < 0.5).any())
 
-    def __call__(self, tensor: Any) -> NDArray[Any]:
+    def __call__(self, tensor: Any, own_tensors: Sequence[Any] = ()) -> NDArray[Any]:
         """The planes of ``Output`` as a NumPy array [planes, rows, cols]."""
         from leafflow_ti.kernels.covariance import covariance_kernels
-        from leafflow_ti.kernels.maps import Output, maps_kernel
-        from leafflow_ti.kernels.patch_fit import patch_fit_kernel
+        from leafflow_ti.kernels.maps import Output, maps_kernels
+        from leafflow_ti.kernels.patch_fit import CLEAR, FINISH, START, patch_fit_kernel
 
-        device, view, problem = self.device, self.view, self.problem
+        device, view, problem, own = self.device, self.view, self.problem, self.problem.own_flows
         lanes = device.dense.lanes
         n_pixels = view.rows * view.pitch
-        solve = ESTIMATORS[problem.estimator](self)
-        covariance = covariance_kernels(device.dense)
+        self.reference.tensor = tensor
+        if own:
+            self._final.tensor = tensor
+            for tables, one in zip(self._own, own_tensors, strict=True):
+                tables.tensor = one
+        covariance, maps = covariance_kernels(device.dense), maps_kernels(device.dense)
         for first in range(0, n_pixels // lanes, self._groups):
             groups = min(self._groups, n_pixels // lanes - first)
             step, stride = (self.layout.n_elements * lanes, lanes) if not device.gpu else (1, groups)
 
             def launch(
-                kernel: Any, value: Any = None, *, which: int = 0, at: Any = (first, groups, step, stride)
-            ) -> None:
+                kernel: Any, tables: _Tables = self.reference, *, which: int = 0, value: Any = None,
+                at: Any = (first, groups, step, stride),
+            ) -> None:  # fmt: skip
                 first, groups, step, stride = at
                 kernel(
-                    first * lanes, n_pixels, groups, step, stride, which, device.tasks(groups), self._number,
-                    self._value if value is None else value, tensor, self._workspace, self._maps,
+                    first * lanes, n_pixels, groups, step, stride, which, device.tasks(groups), tables.on_device[0],
+                    tables.on_device[1] if value is None else value, tables.tensor, self._workspace, self._maps,
                 )  # fmt: skip
 
+            def flow_of(tables: _Tables, solution: int) -> None:
+                """Parameters of one data vector; covariance of its rows along t."""
+                ESTIMATORS[problem.estimator](self, tables)(partial(launch, tables=tables))
+                launch(covariance.row_covariance, tables, which=solution)
+
             self._batch_groups = groups
-            solve(launch)
-            if "t" in problem.columns.solutions:
-                launch(covariance.row_covariance, which=problem.columns.n_time_like - 1)
+            moving = "t" in problem.columns.solutions
+            if moving:
+                flow_of(self.reference, problem.columns.n_time_like - 1)
+            else:
+                ESTIMATORS[problem.estimator](self, self.reference)(launch)
             for camera in range(len(problem.camera_axes)):
                 launch(covariance.row_covariance, which=camera)
                 launch(covariance.add_camera, which=camera)
             if problem.camera_axes:
                 launch(covariance.geometry)
+            if problem.fitted:
+                fit = patch_fit_kernel(device.dense)
+                for i in range(problem.passes):
+                    launch(fit, which=(START if i == 0 else CLEAR) | FINISH)
+            launch(maps.measured)
+            if own:
+                if own.reference_rows:
+                    launch(fit, self._final, which=CLEAR)
+                for i, tables in enumerate(self._own):
+                    flow_of(tables, 0)
+                    clear = CLEAR if i == 0 and not own.reference_rows else 0
+                    launch(fit, tables, which=clear | (FINISH if i == len(self._own) - 1 else 0))
             if problem.unknowns:
-                launch(patch_fit_kernel(device.dense))
-            launch(maps_kernel(device.dense))
+                launch(maps.motion, self._final if own else self.reference)
         planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)
         result: NDArray[Any] = planes[:, :, : view.cols]
         return result

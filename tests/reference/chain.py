@@ -154,10 +154,11 @@ def surface(x0, y0, f, nu, b1=0.0, b2=0.0):
     return Z0, c * p, c * q, c
 
 
-def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline):
+def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 0.0)):
     """Design [rows, 9] by (N, Ω, A) of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
 
     Rows run over the directions, then the offsets. The s-offsets are per camera step at the preshifted pixel.
+    ``moments`` (x, y): second moments of the window, of which the flow's own rows see the second derivatives.
     """
     nu, b1, b2 = geometry
     Z0, ZX, ZY, c = surface(x0, y0, f, nu, b1, b2)
@@ -185,7 +186,7 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline):
         r = np.zeros(9)
         if o == "1":
             r[:3] = -nu * e[k]
-            return r
+            return r + moments[k] / 2 * second_derivative(x0, y0, f, (Z0, ZX, ZY), k)
         r[:3] = -b[o] * e[k]
         if (o, k) in (("x", 0), ("y", 1)):
             r[2] += nu / f
@@ -205,6 +206,25 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline):
     return np.array([measured(k, o) for k in (0, 1) for o in offsets])
 
 
+def second_derivative(x0, y0, f, plane, k):
+    """Coefficients [9] of (N, Ω, A) in ∂²u_k/∂x_k² on the plane (Z0, ZX, ZY) seen at (x0, y0), by exact differences.
+
+    The flow of a rigidly moving plane is quadratic in x and y, so second differences of any width are exact.
+    """
+    Z0, ZX, ZY = plane
+    X0 = Z0 * np.array([x0 / f, y0 / f, 1.0])
+
+    def flow(d, q):
+        x, y = (x0 + d, y0) if k == 0 else (x0, y0 + d)
+        ray = np.array([x / f, y / f, 1.0])
+        X = (Z0 - ZX * X0[0] - ZY * X0[1]) / (1 - ZX * ray[0] - ZY * ray[1]) * ray
+        U = q[:3] + np.cross(q[3:6], X - X0)
+        return f * (U[k] - ray[k] * U[2]) / X[2]
+
+    h = 0.05 * f
+    return np.array([(flow(h, q) - 2 * flow(0, q) + flow(-h, q)) / h**2 for q in np.eye(9)])
+
+
 def range_row(x0, y0, f, geometry):
     """Design [9] of the range constraint for b_t (5.23)."""
     Z0, ZX, ZY, c = surface(x0, y0, f, *geometry)
@@ -213,65 +233,143 @@ def range_row(x0, y0, f, geometry):
     return r
 
 
-def fit_motion(
-    x0,
-    y0,
-    f,
-    P,
-    cov,
-    columns,
-    geometry,
-    offsets,
-    use_range,
-    n,
-    baseline,
-    shift,
-    weighted=True,
-    passes=4,
-    caution=1.0,
-):
-    """The first ``n`` of (N, Ω, A) and their covariance; ``geometry`` is what fit_geometry returned.
+def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampling, own_sampling, step):
+    """Covariance [n_flow, n_flow of the own flow], over image noise variances and ρ, of the motion parameters of the
+    grid's columns and of those of the camera at ``step``: the grid's normal equations hold its image with the weights of
+    window and smoothing."""
+    n, m = columns.n_flow, own_columns.n_flow
+    noise = J_own[:m, :m] * noise_ratio(own_sampling, own_columns, "t")
+    X = np.zeros((n, m))
+    for a, column in enumerate(columns.columns[:n]):
+        factor = 1.0
+        exponents = dict(zip(AXES, column.exponents, strict=True))
+        for axis, k in zip(("sx", "sy"), step, strict=True):
+            weights, smooth = np.array(sampling.axis(axis).weights), sampling.axis(axis).kernel(False)
+            half, radius = len(weights) // 2, len(smooth) // 2
+            factor *= sum(
+                weights[i + half] * float(i) ** exponents[axis] * smooth[k - i + radius]
+                for i in range(-half, half + 1)
+                if abs(k - i) <= radius
+            )
+        kept = tuple(0 if axis in ("sx", "sy") else e for axis, e in exponents.items())
+        partner = [b for b, c in enumerate(own_columns.columns[:m]) if (c.channel, c.exponents) == (column.channel, kept)]
+        if partner:
+            X[a] = factor * noise[partner[0]]
+    return P_inverse @ X @ own_inverse
 
-    The rows' covariance holds the noise of the motion parameters, of the geometry that the design is built from, and
-    what both have in common. The weights leave the common part out: b_t and a_s measure the same mixed derivative with
-    the same noise, and weights that knew it would stake everything on the difference of the two. ``caution`` multiplies
-    the standard error of b_t in the weights.
+
+def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()):
+    """The motion (N, Ω, A) and the covariance of its unknowns; ``geometry`` is what fit_geometry returned.
+
+    ``own``: (J, ρ) of every camera's own flow, in the order of ``problem.own_flows.steps``. First a fit to the rows of
+    the reference model; with own flows, one more to all rows, linearised there. The rows' covariance holds the noise of
+    the motion parameters, of the geometry that the design is built from, what both have in common and what cameras have
+    in common with the reference model. The weights leave out what is common to sets of rows, and to geometry and motion.
     """
-    names, g, cov_g, cross = geometry
-    k = columns.solutions.index("t")
-    rows = [columns.index(d, o) for d in ("x", "y") for o in offsets]
-    value = P[rows, k]
-    base = cov[k, k][np.ix_(rows, rows)]
-    cross = cross[:, rows]
-    factors = [1.0] * (2 * len(offsets)) + [caution] * use_range
-    if use_range:
-        it = names.index("t")
-        value = np.append(value, g[it])
-        base = np.pad(base, ((0, 1), (0, 1)))
-        cross = np.pad(cross, ((0, 0), (0, 1)))
-
-    def design(geometry, q):
-        A = motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline)
-        return np.vstack([A, range_row(x0, y0, f, geometry)])[:, :n] if use_range else A[:, :n]
-
-    q = np.zeros(n)
+    columns, sampling, f = problem.columns, problem.sampling, view.f_px
+    shift, baseline = view.shift_px, view.baseline_mm
+    names, g, cov_g, cross_g = geometry
+    moments = sampling.x.moment(2), sampling.y.moment(2)
     surface_terms = np.zeros(3)
     surface_terms[: min(3, len(g))] = g[:3]
-    for _ in range(passes):
+    k = columns.solutions.index("t")
+    it = names.index("t") if "t" in names else None
+    clean = J[: columns.n_flow, : columns.n_flow] - estimate.DENOISE[problem.estimator] * np.min(variance) * np.diag(
+        column_noise(sampling, columns)[: columns.n_flow]
+    )
+    inverse = np.linalg.inv(clean)
+
+    def rows_of(value, C, shared, design, codes, has_range, q):
+        """Design, values, own covariance with what the equations leave out, sensitivity, covariance with the geometry."""
         A = design(surface_terms, q)
         D = np.zeros((len(value), len(g)))
         for i in range(min(3, len(g))):
             step = np.zeros(3)
             step[i] = 1e-4 * abs(g[0]) * (1 if i == 0 else 1 / f)
             D[:, i] = -(design(surface_terms + step, q) - design(surface_terms - step, q)) @ q / (2 * step[i])
-        if use_range:
+        if has_range:
             D[-1, it] += 1.0
-        spread = base + D @ cov_g @ D.T
-        total = spread + D @ cross + cross.T @ D.T
-        W = np.linalg.inv(spread * np.outer(factors, factors)) if weighted else np.eye(len(value))
-        G = np.linalg.solve(A.T @ W @ A, A.T @ W)
-        q = G @ value
-    return q, G @ total @ G.T
+        floor = np.array([estimate.MODEL_ERROR[code] for code in codes]) * (np.abs(A) @ np.abs(q))
+        return A, value, C + np.diag(floor**2), D, shared
+
+    def reference_rows(q):
+        rows = [columns.index(d, o) for d in ("x", "y") for o in problem.offsets]
+        value, C, shared = P[rows, k], cov[k, k][np.ix_(rows, rows)], cross_g[:, rows]
+        codes = [*problem.offsets, *problem.offsets]
+        if problem.use_range:
+            value, C = np.append(value, g[it]), np.pad(C, ((0, 1), (0, 1)))
+            shared = np.pad(shared, ((0, 0), (0, 1)))
+            codes.append("range")
+
+        def design(geometry, q):
+            A = motion_rows(x0, y0, f, geometry, problem.offsets, q, shift, baseline, moments)
+            return np.vstack([A, range_row(x0, y0, f, geometry)]) if problem.use_range else A
+
+        return rows_of(value, C, shared, design, codes, problem.use_range, q), rows
+
+    def own_rows(step, J_own, rho_own, q):
+        flows = problem.own_flows
+        p, s2 = solve(J_own, flows.columns, flows.sampling, problem.estimator)
+        C = covariances(J_own, s2, flows.columns, flows.sampling, rho_own, estimate.DENOISE[problem.estimator])[0, 0]
+        rows = [flows.columns.index(d, o) for d in ("x", "y") for o in flows.offsets]
+        E = np.eye(flows.columns.n_flow)[rows]
+        moved = [step[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
+        for r, (d, o) in enumerate((d, o) for d in ("x", "y") for o in flows.offsets):
+            if o == "1":
+                for axis, distance in zip(("x", "y"), moved, strict=True):
+                    E[r, flows.columns.index(d, axis)] += distance
+        x, y = (at + g[0] * baseline[i] * step[i] for i, at in enumerate((x0, y0)))
+
+        def design(geometry, q):
+            Z0, ZX, ZY, _ = surface(x0, y0, f, *geometry)
+            c = 1 - ZX * x / f - ZY * y / f
+            there = (-f / Z0, ZX / (Z0 * c), ZY / (Z0 * c))
+            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, moments)
+
+        codes = [*flows.offsets, *flows.offsets]
+        found = rows_of(E @ p[:, 0], E @ C @ E.T, np.zeros((len(g), len(rows))), design, codes, False, q)
+        n = flows.columns.n_flow
+        noise = np.diag(column_noise(flows.sampling, flows.columns)[:n])
+        own_inverse = np.linalg.inv(J_own[:n, :n] - estimate.DENOISE[problem.estimator] * s2[0] * noise)
+        shared = shared_covariance(
+            J_own, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
+        ) * (rho_own * np.sqrt(variance[k] * s2[0]))
+        return found, shared @ E.T
+
+    def fit(sets, n, common):
+        """Unknowns [n] and covariance; ``common``: covariance of the first set's rows with each other set's."""
+        weights = []
+        for _, _, C, D, _ in sets:
+            weights.append(np.linalg.inv(C + D @ cov_g @ D.T) if problem.weighted else np.eye(len(C)))
+        normal = sum(A[:, :n].T @ W @ A[:, :n] for (A, *_), W in zip(sets, weights, strict=True))
+        gains = [np.linalg.solve(normal, A[:, :n].T @ W) for (A, *_), W in zip(sets, weights, strict=True)]
+        solution = sum(G @ s[1] for G, s in zip(gains, sets, strict=True))
+        by_geometry = sum(G @ s[3] for G, s in zip(gains, sets, strict=True))
+        spread = sum(G @ s[2] @ G.T for G, s in zip(gains, sets, strict=True)) + by_geometry @ cov_g @ by_geometry.T
+        for G, s in zip(gains, sets, strict=True):
+            part = by_geometry @ s[4] @ G.T
+            spread += part + part.T
+        for G, C in zip(gains[1:], common, strict=True):
+            part = gains[0] @ C @ G.T
+            spread += part + part.T
+        return solution, spread
+
+    q = np.zeros(9)
+    for _ in range(problem.passes):
+        first, rows = reference_rows(q)
+        q[: problem.fitted], spread = fit([first], problem.fitted, [])
+    if problem.own_flows is None:
+        return q[: problem.fitted], spread
+    first, rows = reference_rows(q)
+    sets, common = ([first], []) if problem.own_flows.reference_rows else ([], [])
+    for step, (J_own, rho_own) in zip(problem.own_flows.steps, own, strict=True):
+        found, shared = own_rows(step, J_own, rho_own, q)
+        if problem.own_flows.reference_rows:
+            common.append(np.pad(shared[rows], ((0, problem.use_range), (0, 0))))
+        elif sets:
+            common.append(np.zeros((len(sets[0][1]), len(found[1]))))
+        sets.append(found)
+    return fit(sets, problem.own_flows.unknowns, common)
 
 
 def solve(J, columns: ColumnSet, sampling: Sampling, estimator):
@@ -284,8 +382,11 @@ def solve(J, columns: ColumnSet, sampling: Sampling, estimator):
     return P, noise_variance(J, P, columns, noise)
 
 
-def measure(J, rho, problem, view, x, y):
-    """Every map of one pixel (x, y): name -> (value, standard error). ``problem``, ``view``: what the stages get."""
+def measure(J, rho, problem, view, x, y, own=()):
+    """Every map of one pixel (x, y): name -> (value, standard error). ``problem``, ``view``: what the stages get.
+
+    ``own``: (J, ρ) of every camera's own flow.
+    """
     columns, sampling = problem.columns, problem.sampling
     P, variance = solve(J, columns, sampling, problem.estimator)
     cov = covariances(J, variance, columns, sampling, rho, estimate.DENOISE[problem.estimator])
@@ -320,11 +421,7 @@ def measure(J, rho, problem, view, x, y):
         put("slope_x", lambda g: surface(x0, y0, f, *g)[1])
         put("slope_y", lambda g: surface(x0, y0, f, *g)[2])
     if problem.unknowns:
-        q, cov_q = fit_motion(
-            x0, y0, f, P, cov, columns, geometry, problem.offsets, problem.use_range, problem.unknowns,
-            view.baseline_mm, view.shift_px, problem.weighted, problem.passes,
-            estimate.RANGE_CAUTION,
-        )  # fmt: skip
+        q, cov_q = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
         for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=True):
             found[name] = (value, error)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-def ols(stage: Any) -> Callable[[Callable[..., None]], None]:
+def ols(stage: Any, tables: Any) -> Callable[[Callable[..., None]], None]:
     """``J_ff p = -J_f,time`` for every solution, by one Cholesky factor."""
     from leafflow_ti.kernels.null_space import null_space_kernels
 

@@ -13,14 +13,14 @@ from typing import Any
 Solve = Callable[[Callable[..., None]], None]
 
 
-def tls_equilibrated(stage: Any) -> Solve:
+def tls_equilibrated(stage: Any, tables: Any) -> Solve:
     """The k smallest eigenvectors of ``C^-1/2 J C^-1/2``."""
     return _null_space(stage, None)
 
 
-def tls(stage: Any) -> Solve:
+def tls(stage: Any, tables: Any) -> Solve:
     """The k smallest eigenvectors of J itself; depends on the units of the columns (section 2.3.3)."""
-    return _null_space(stage, stage.unscaled())
+    return _null_space(stage, stage.device.array(stage.unscaled(tables.value), "algebra"))
 
 
 def _null_space(stage: Any, value: Any) -> Solve:
@@ -29,14 +29,14 @@ def _null_space(stage: Any, value: Any) -> Solve:
     kernels = null_space_kernels(stage.device.dense)
 
     def solve(launch: Callable[..., None]) -> None:
-        launch(kernels.load, value)
-        launch(kernels.least_squares, value)
+        launch(kernels.load, value=value)
+        launch(kernels.least_squares, value=value)
         if stage.problem.solver == "fast":
-            launch(kernels.inverse_iteration, value)
+            launch(kernels.inverse_iteration, value=value)
         if stage.unsolved():
             # All pixels, or those whose gap is too small for the iteration.
-            launch(kernels.jacobi, value)
-        launch(kernels.parameters, value)
+            launch(kernels.jacobi, value=value)
+        launch(kernels.parameters, value=value)
         if value is not None:
             # Residuals and covariances are worked out on the equilibrated tensor.
             launch(kernels.load)
