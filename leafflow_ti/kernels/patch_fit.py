@@ -218,7 +218,7 @@ def patch_fit_kernel(spec: KernelSpec):
     def row_spread(
         base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
     ):
-        """OWN: noise of the rows and what their equations leave out; FACTOR: that and the geometry's noise in them.
+        """OWN: noise of the rows; FACTOR, for the weights: that, the geometry's noise in them, and what they leave out.
 
         What an equation leaves out is a share of the sizes of its terms.
         """
@@ -235,6 +235,7 @@ def patch_fit_kernel(spec: KernelSpec):
                     own = cov_t + tri(r, c) * stride
                     for i in range(lanes):
                         spread[i] = ws[own + i]
+                small.store(ws, base + (number[Region.OWN] + tri(r, c)) * stride, spread)
                 if r == c:
                     code = RANGE_CODE
                     if r < 2 * offsets:
@@ -248,7 +249,6 @@ def patch_fit_kernel(spec: KernelSpec):
                     share = value[Value.MODEL_ERROR + code]
                     for i in range(lanes):
                         spread[i] += share * share * size[i] * size[i]
-                small.store(ws, base + (number[Region.OWN] + tri(r, c)) * stride, spread)
                 for one in range(terms):
                     da = d + (r * terms + one) * stride
                     for two in range(terms):

@@ -280,7 +280,7 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
     inverse = np.linalg.inv(clean)
 
     def rows_of(value, C, shared, design, codes, has_range, q):
-        """Design, values, own covariance with what the equations leave out, sensitivity, covariance with the geometry."""
+        """Design, values, own covariance, sensitivity, covariance with the geometry, what the equations leave out."""
         A = design(surface_terms, q)
         D = np.zeros((len(value), len(g)))
         for i in range(min(3, len(g))):
@@ -290,7 +290,7 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         if has_range:
             D[-1, it] += 1.0
         floor = np.array([estimate.MODEL_ERROR[code] for code in codes]) * (np.abs(A) @ np.abs(q))
-        return A, value, C + np.diag(floor**2), D, shared
+        return A, value, C, D, shared, np.diag(floor**2)
 
     def reference_rows(q):
         rows = [columns.index(d, o) for d in ("x", "y") for o in problem.offsets]
@@ -339,8 +339,8 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
     def fit(sets, n, common):
         """Unknowns [n] and covariance; ``common``: covariance of the first set's rows with each other set's."""
         weights = []
-        for _, _, C, D, _ in sets:
-            weights.append(np.linalg.inv(C + D @ cov_g @ D.T) if problem.weighted else np.eye(len(C)))
+        for _, _, C, D, _, left_out in sets:
+            weights.append(np.linalg.inv(C + D @ cov_g @ D.T + left_out) if problem.weighted else np.eye(len(C)))
         normal = sum(A[:, :n].T @ W @ A[:, :n] for (A, *_), W in zip(sets, weights, strict=True))
         gains = [np.linalg.solve(normal, A[:, :n].T @ W) for (A, *_), W in zip(sets, weights, strict=True)]
         solution = sum(G @ s[1] for G, s in zip(gains, sets, strict=True))
