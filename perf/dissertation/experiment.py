@@ -111,7 +111,8 @@ class Diagram:
 def diagrams(panel: Panel, x_label: str, quantities: Iterable[str], **options: Any) -> tuple[Diagram, ...]:
     """One diagram per quantity with all variants of a panel."""
     curves = {variant.label: (panel.name, variant.label) for variant in panel.variants}
-    return tuple(Diagram(panel.name, quantity, x_label, curves, **options) for quantity in quantities)
+    named = {"title": panel.name, **options}
+    return tuple(Diagram(quantity=quantity, x_label=x_label, curves=curves, **named) for quantity in quantities)
 
 
 class Printed(NamedTuple):
