@@ -55,21 +55,11 @@ MODELS: dict[str, Model] = {
     "affine-4d": Model(("x", "y", "s", "t"), "line", True, "4D affine model (5.24)", ANY_MOTION),
     "affine-5d": Model(("x", "y", "s", "t"), "grid", True, "5D affine model (6.10)", ANY_MOTION),
     "scene-flow": Model(
-        ("x", "y", "s", "t"),
-        "grid",
-        True,
-        "velocity from the flow of every camera (3.4)",
-        ("translation",),
-        True,
-        False,
+        ("x", "y", "s", "t"), "grid", True, "velocity from the flow of every camera (3.4)", ("translation",), True, False
     ),
     "affine-scene-flow": Model(
-        ("x", "y", "s", "t"),
-        "grid",
-        True,
-        "4D or 5D affine model and the affine flow of every camera (6.15)",
-        ANY_MOTION,
-        True,
+        ("x", "y", "s", "t"), "grid", True, "4D or 5D affine model and the affine flow of every camera (6.15)",
+        ANY_MOTION, True,
     ),
 }
 

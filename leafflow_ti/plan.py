@@ -214,9 +214,7 @@ def _motion(config: RunConfig, name: str) -> str | None:
     wanted, motions = config.model.motion, MODELS[name].motions
     if wanted != "auto" and wanted not in motions:
         can = f"it measures {', '.join(motions)}" if motions else "it measures no 3D motion"
-        raise ConfigError(
-            f"motion '{wanted}': model '{name}' does not have it, {can}: choose --motion auto or another model"
-        )
+        raise ConfigError(f"motion '{wanted}': model '{name}' does not have it, {can}: choose --motion auto or another model")
     return (motions[0] if wanted == "auto" else wanted) if motions else None
 
 
@@ -321,9 +319,7 @@ def _band_rows(config: RunConfig, problem: Problem, layout: TensorLayout, rows: 
         total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
         own = problem.own_flows
         if own:
-            total += len(own.steps) * band_bytes(
-                own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize
-            )
+            total += len(own.steps) * band_bytes(own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize)
         return total
 
     limit = int(0.8 * config.plan.max_memory)

@@ -141,8 +141,8 @@ PRINTED_RANGE = {"N": (1e-4, 1e-3), "Omega": (1e-5, 1e-4)}
 REASONS = {
     "rotation [deg/frame]": "at .1° per frame the surface turns .9° within the nine frames, and terms of second order, "
     "which the affine model leaves out, reach the upper end of the printed range; section 5.3 itself has .003°.",
-    "acceleration [mm/frame²]": "at .003 mm/frame² the velocity changes by 40 % of its size within the nine frames; the "
-    "flow is then no longer affine in time, which no set of rows can mend.",
+    "acceleration [mm/frame²]": "at .003 mm/frame² the velocity changes by 40 % of its size within the nine frames; "
+    "the flow is then no longer affine in time, which no set of rows can mend.",
 }
 """Why the worst points lie above the printed range, by the abscissa."""
 

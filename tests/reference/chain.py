@@ -252,9 +252,7 @@ def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampl
                 if abs(k - i) <= radius
             )
         kept = tuple(0 if axis in ("sx", "sy") else e for axis, e in exponents.items())
-        partner = [
-            b for b, c in enumerate(own_columns.columns[:m]) if (c.channel, c.exponents) == (column.channel, kept)
-        ]
+        partner = [b for b, c in enumerate(own_columns.columns[:m]) if (c.channel, c.exponents) == (column.channel, kept)]
         if partner:
             X[a] = factor * noise[partner[0]]
     return P_inverse @ X @ own_inverse
