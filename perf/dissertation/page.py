@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from html import escape
@@ -149,10 +150,8 @@ def _explanations(worse: Iterable[Cell]) -> str:
 
 
 def _failures(result: Result) -> str:
-    found: dict[tuple[str, str], list[str]] = {}
-    for failure in result.failures:
-        found.setdefault((failure.variant, failure.message), []).append(f"{failure.x:g}")
-    lines = [f"<li>{escape(v)} (at {', '.join(xs)}): {escape(m)}</li>" for (v, m), xs in found.items()]
+    found = Counter((failure.variant, failure.message) for failure in result.failures)
+    lines = [f"<li>{escape(v)} ({n} scene{'s' * (n > 1)}): {escape(m)}</li>" for (v, m), n in found.items()]
     return f"<p>Not measured:</p><ul>{''.join(lines)}</ul>" if lines else ""
 
 

@@ -68,6 +68,7 @@ def _draw(axes: Any, diagram: Diagram, result: Result, handles: dict[str, Any]) 
     low, high = axes.get_ylim()
     if high < 10.0 * low:  # small changes should look small
         axes.set_ylim(math.sqrt(low * high / 10.0), math.sqrt(low * high * 10.0))
+    axes.yaxis.set_minor_formatter("")
     if diagram.x_log:
         axes.set_xscale("log")
     axes.set_xlabel(diagram.x_label)
