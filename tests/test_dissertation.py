@@ -121,6 +121,11 @@ def test_cells_are_better_worse_or_not_measured() -> None:
     assert nothing.better is None
 
 
+def test_what_the_quick_version_leaves_out_is_not_compared() -> None:
+    assert all(cell.better is False for cell in table_cells(TABLE, Result("e", False))[0])
+    assert all(cell.better is None for cell in table_cells(TABLE, Result("e", True))[0])
+
+
 def test_a_diagram_is_held_to_the_upper_end_of_the_printed_range() -> None:
     diagram = Diagram("d", "N", "x", {"a": ("p", "a")}, printed=(0.1, 0.35), best="a", reason="too steep")
     result = Result("e", False, records=[_record(), _record(x=1.0, mean=0.34)])
@@ -235,5 +240,5 @@ def test_the_page_can_be_drawn_once_more(tmp_path: Path) -> None:
 def test_quick_panels_keep_both_ends_of_the_abscissa() -> None:
     points = tuple(Point(float(x), scenes.sinusoid()) for x in range(6))
     panel = Panel("p", points, (), (0, 0), (0, 0, 1, 1), 4, seeds=3).quick()
-    assert [point.x for point in panel.points] == [0.0, 3.0, 5.0]
+    assert [point.x for point in panel.points] == [0.0, 5.0]
     assert (panel.seeds, panel.stride) == (1, 8)

@@ -85,6 +85,8 @@ def _cell(table: Table, row: str, column: str, result: Result) -> Cell:
     selection = {**table.rows[row], **table.columns[column]}
     statistic: Statistic = selection.get("statistic", "mean")
     record = select(result, selection)
+    if record is None and result.quick and not _failure(result, selection):
+        return Cell(row, column, math.nan, "–", note="not in the quick version")
     printed = table.printed.get((row, column))
     cell = _measured(row, column, record, statistic, _failure(result, selection))
     cell = replace(
