@@ -230,7 +230,7 @@ def test_diagrams_are_drawn_with_a_legend() -> None:
 
 
 def test_the_page_can_be_drawn_once_more(tmp_path: Path) -> None:
-    store.save(tmp_path / "dissertation", Result("table-5.1", True, records=[_record()]))
+    store.save(tmp_path / "dissertation", Result("table-5.1", False, records=[_record()]))
     outcome = case.run(Options(tmp_path, case=case.REDRAW))
     assert outcome.pictures[0].is_file()
     assert any(figure.name.startswith("table-5.1") for figure in outcome.figures)
