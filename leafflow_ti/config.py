@@ -22,11 +22,12 @@ from leafflow_ti.field import quantity
 
 Preset = Literal["fast", "balanced", "accurate"]
 ModelName = Literal[
-    "auto", "flow", "flow-affine", "depth", "affine-translation", "affine", "affine-4d", "affine-5d", "scene-flow",
-    "affine-scene-flow",
+    "auto", "flow", "flow-affine", "flow-quadratic", "depth", "affine-translation", "affine", "affine-4d", "affine-5d",
+    "scene-flow", "affine-scene-flow",
 ]  # fmt: skip
 Motion = Literal["auto", "translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
+BrightnessTerms = Literal["none", "time", "space", "both"]
 Estimator = Literal["ols", "tls", "tls-equilibrated"]
 Solver = Literal["fast", "jacobi"]
 Border = Literal["full", "clip"]
@@ -122,13 +123,17 @@ class _Section(BaseModel):
 
 
 class ModelSection(_Section):
-    """Which parameters are estimated, and how. ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its
-    derivatives along x, y) followed by any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can."""
+    """Which parameters are estimated, and how.
+
+    ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its derivatives along x, y) followed by
+    any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can.
+    """
 
     name: ModelName = "auto"
     motion: Motion = "auto"
     rows: str = "auto"
     brightness: Brightness = "none"
+    brightness_terms: BrightnessTerms = "none"
     estimator: Estimator = "tls-equilibrated"
     solver: Solver = "fast"
     weighting: Weighting = "wls"

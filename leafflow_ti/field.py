@@ -36,11 +36,14 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "flow_x": ("px/frame", "optical flow along x"),
     "flow_y": ("px/frame", "optical flow along y"),
     "brightness_t": ("1/frame", "relative brightness change per frame"),
-    "brightness_tt": ("1/frame²", "change of the relative brightness change per frame"),
     "brightness_tx": ("1/(frame px)", "relative brightness change per frame, slope along x"),
     "brightness_ty": ("1/(frame px)", "relative brightness change per frame, slope along y"),
+    "brightness_tt": ("1/frame²", "change of the relative brightness change per frame"),
     "brightness_sx": ("1/step", "relative brightness change per camera step along x"),
     "brightness_sy": ("1/step", "relative brightness change per camera step along y"),
+    "brightness_world_x": ("1/(frame mm)", "relative brightness change per frame, slope along X on the surface"),
+    "brightness_world_y": ("1/(frame mm)", "relative brightness change per frame, slope along Y on the surface"),
+    "brightness_world_tt": ("1/frame²", "change of the relative brightness change per frame of a surface point"),
     "growth_rate": ("%/frame", "relative growth rate of the surface area"),
 }
 """Name of a map -> (unit, long name). Every map may have a companion ``NAME_std``, its standard error."""

@@ -248,7 +248,7 @@ class Pipeline:
         maps = {}
         for name in self.plan.names:
             base = name.removesuffix("_std")
-            plane = _plane_of(base, self.plan.problem.columns.solutions) + (Output.STD if name != base else 0)
+            plane = _plane_of(base) + (Output.STD if name != base else 0)
             maps[name] = planes[plane].astype(np.float32)
         has_value = np.isin(status, HAS_VALUE)
         for values in maps.values():
@@ -257,14 +257,12 @@ class Pipeline:
         return maps, status
 
 
-def _plane_of(name: str, solutions: tuple[str, ...]) -> int:
+def _plane_of(name: str) -> int:
     from leafflow_ti.kernels.maps import Output
     from leafflow_ti.plan import MOTION_NAMES
 
     if name in MOTION_NAMES:
         return Output.MOTION + MOTION_NAMES.index(name)
-    if name.startswith("brightness_"):
-        return Output.BRIGHTNESS + solutions.index(name.removeprefix("brightness_"))
     return int(Output[name.upper()])
 
 

@@ -5,7 +5,7 @@ It is what ``--dry-run`` prints and what the pipeline executes. Making it reads 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import choose_filter_set, filter_set
 from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set, parse_rows
 from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.estimate import OwnFlows, Problem, unknowns_of
+from leafflow_ti.stages.estimate import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -89,7 +89,9 @@ class Plan:
         if "t" in problem.columns.solutions:
             names += ["flow_x", "flow_y"]
         if problem.columns.index("i") is not None:
-            names += [f"brightness_{a}" for a in problem.columns.solutions]
+            names += [f"brightness_{a}" for a in problem.camera_axes]
+        names += [BRIGHTNESS_MAPS[o] for o in problem.brightness]
+        names += [WORLD_MAPS[o] for o in problem.world_brightness]
         return tuple(names)
 
     def band(self, index: int) -> slice:
@@ -128,8 +130,8 @@ class Plan:
             taken = [f"{n_rows} rows ({rows})"] if own is None or own.reference_rows else []
             if own:
                 taken.append(
-                    f"{2 * len(own.offsets)} rows ({'+'.join(own.offsets)}) of each of {len(own.steps)} cameras' own flow, "
-                    f"{own.columns.n} columns"
+                    f"{2 * len(own.offsets)} rows ({'+'.join(own.offsets)}) of each of {len(own.steps)} cameras' own "
+                    f"flow, {own.columns.n} columns"
                 )
             lines.append(f"motion      {problem.unknowns} unknowns from {' and '.join(taken)}")
         pixels = len(self.frames) * len(self.y) * len(self.x)
@@ -170,10 +172,13 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         _series(capture.n_rows, row, *camera) if use_y else AxisSampling(),
         _series(capture.n_frames, capture.n_frames // 2, *time, sequence=True) if model.time else AxisSampling(),
     )
-    columns = column_set(model, config.model.brightness, sampling.camera_axes, sampling.sampled)
+    columns = column_set(
+        model, config.model.brightness, sampling.camera_axes, sampling.sampled, config.model.brightness_terms
+    )
     grid = bool(sampling.camera_axes)
     motion = _motion(config, name)
-    offsets, use_range, fitted, own = ("1",), False, 0, None
+    offsets: tuple[str, ...] = ("1",)
+    use_range, fitted, own = False, 0, None
     if motion:
         rows = config.model.rows if model.reference_rows else "2d"
         offsets, use_range = parse_rows(rows, name, motion, columns)
@@ -185,8 +190,8 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
                 fitted = min(fitted, n_rows)
         if fitted > n_rows:
             raise ConfigError(
-                f"motion '{motion}' has {fitted} unknowns, rows '{config.model.rows}' give {n_rows} equations: choose more "
-                "rows, a simpler motion, or more frames and cameras"
+                f"motion '{motion}' has {fitted} unknowns, rows '{config.model.rows}' give {n_rows} equations: choose "
+                "more rows, a simpler motion, or more frames and cameras"
             )
     problem = Problem(
         columns, sampling, config.model.estimator, config.model.solver, config.model.weighting == "wls",
@@ -214,7 +219,9 @@ def _motion(config: RunConfig, name: str) -> str | None:
     wanted, motions = config.model.motion, MODELS[name].motions
     if wanted != "auto" and wanted not in motions:
         can = f"it measures {', '.join(motions)}" if motions else "it measures no 3D motion"
-        raise ConfigError(f"motion '{wanted}': model '{name}' does not have it, {can}: choose --motion auto or another model")
+        raise ConfigError(
+            f"motion '{wanted}': model '{name}' does not have it, {can}: choose --motion auto or another model"
+        )
     return (motions[0] if wanted == "auto" else wanted) if motions else None
 
 
@@ -226,11 +233,12 @@ def _own_flows(
     if not model.reference_rows:
         if config.model.rows not in ("auto", "u"):
             raise ConfigError(
-                f"rows '{config.model.rows}': model 'scene-flow' takes the flow alone: choose rows u, or affine-scene-flow"
+                f"rows '{config.model.rows}': model 'scene-flow' takes the flow alone: choose rows u, or "
+                "affine-scene-flow"
             )
         offsets = ("1",)
     alone = Sampling(sampling.x, sampling.y, t=sampling.t)
-    columns = column_set(OWN_FLOW, config.model.brightness, (), alone.sampled)
+    columns = column_set(OWN_FLOW, config.model.brightness, (), alone.sampled, config.model.brightness_terms)
     steps = [(i - reference[1], j - reference[0]) for j in range(counts[0]) for i in range(counts[1])]
     if model.reference_rows:
         steps.remove((0, 0))
@@ -319,7 +327,9 @@ def _band_rows(config: RunConfig, problem: Problem, layout: TensorLayout, rows: 
         total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
         own = problem.own_flows
         if own:
-            total += len(own.steps) * band_bytes(own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize)
+            total += len(own.steps) * band_bytes(
+                own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize
+            )
         return total
 
     limit = int(0.8 * config.plan.max_memory)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,9 +78,13 @@ class Sampling:
         return tuple(a for a in ("sx", "sy") if self.axis(a).filters is not None)
 
     @property
-    def sampled(self) -> tuple[str, ...]:
-        """Axes along which the window holds more than one sample."""
-        return tuple(a for a in AXES if self.axis(a).size > 1)
+    def sampled(self) -> dict[str, float]:
+        """Axes along which the window holds more than one sample, and the second moment of its weights."""
+        return {a: self.axis(a).moment(2) for a in AXES if self.axis(a).size > 1}
+
+    def moment(self, exponents: tuple[int, ...]) -> float:
+        """``Σ w(Δ) Δ^exponents`` over the whole window."""
+        return float(np.prod([self.axis(a).moment(e) for a, e in zip(AXES, exponents, strict=True)]))
 
 
 def noise_gain(sampling: Sampling, channel: str) -> float:
@@ -100,14 +105,22 @@ def white_smoothness(sampling: Sampling) -> float:
 def column_noise(sampling: Sampling, columns: ColumnSet) -> Array:
     """Diagonal of ``C = Σ w C_i``, the noise covariance of the columns summed over the window; shape (N,).
 
-    For symmetric windows C is diagonal: the filters of different channels are orthogonal, and odd moments vanish.
+    For symmetric windows C is diagonal: the filters of different channels are orthogonal, odd moments vanish, and
+    squares are centred.
     """
 
     def of(column: Column) -> float:
-        moments = [sampling.axis(a).moment(2 * e) for a, e in zip(AXES, column.exponents, strict=True)]
-        return noise_gain(sampling, column.channel) * float(np.prod(moments))
+        return sum(
+            p.factor * q.factor * noise_gain(sampling, p.channel) * sampling.moment(_sum(p.exponents, q.exponents))
+            for p, q in product(column.terms, repeat=2)
+            if (p.channel, p.vector) == (q.channel, q.vector)
+        )
 
     return np.array([of(c) for c in columns.columns])
+
+
+def _sum(one: tuple[int, ...], two: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(m + n for m, n in zip(one, two, strict=True))
 
 
 def _pixel_factor(axis: AxisSampling, m: int, n: int) -> float:
@@ -128,33 +141,9 @@ def _series_factor(axis: AxisSampling, differentiate: bool, m: int, n: int) -> f
     return float(noise / axis.moment(m + n))
 
 
-def noise_ratio(sampling: Sampling, columns: ColumnSet, solution: str) -> Array:
-    """Table K with ``Cov(Σ w f n) = σ² ρ J_ff ∘ K`` for the solution along ``solution``; shape (n_flow, n_flow).
-
-    ``f`` are the columns that are not time-like and ``n`` the residual that image noise of variance σ² leaves. In the
-    frame that moves with the texture, n is the derivative of the noise along ``solution`` smoothed along all other
-    axes; f is then constant along camera and time axes, where the few samples are summed exactly (the noise of a
-    derivative telescopes there). In x and y, w is smooth on the scale of the filters, so the sum runs over w², and
-    the smoothing meets the texture's own spectrum: that is the factor ρ, measured per pixel.
-    """
-
-    def factor(a: Column, b: Column) -> float:
-        product = 1.0
-        for name, m, n in zip(AXES, a.exponents, b.exponents, strict=True):
-            axis = sampling.axis(name)
-            if name in ("x", "y"):
-                product *= _pixel_factor(axis, m, n)
-            else:
-                product *= _series_factor(axis, name == solution, m, n)
-        return product
-
-    flow = columns.columns[: columns.n_flow]
-    return np.array([[factor(a, b) for b in flow] for a in flow])
-
-
 @dataclass(frozen=True)
-class CrossTerm:
-    """``Cov(Σ w f_a n_i, Σ w f_b n_j) = σ² ρ J[base_a, base_b] value`` for two different solutions i, j."""
+class NoiseTerm:
+    """Part of a noise covariance: ``Cov(Σ w f_a n_i, Σ w f_b n_j) += σ² ρ J[base_a, base_b] value``."""
 
     a: int
     b: int
@@ -163,7 +152,48 @@ class CrossTerm:
     value: float
 
 
-def cross_noise(sampling: Sampling, columns: ColumnSet, first: str, second: str) -> tuple[CrossTerm, ...]:
+def noise_ratio(sampling: Sampling, columns: ColumnSet, solution: str) -> tuple[Array, tuple[NoiseTerm, ...]]:
+    """``Cov(Σ w f n) = σ² ρ (J_ff ∘ K + terms)`` for the solution along ``solution``: K [n_flow, n_flow] and terms.
+
+    ``f`` are the columns that are not time-like and ``n`` the residual that image noise of variance σ² leaves. In the
+    frame that moves with the texture, n is the derivative of the noise along ``solution`` smoothed along all other
+    axes; f is then constant along camera and time axes, where the few samples are summed exactly (the noise of a
+    derivative telescopes there). In x and y, w is smooth on the scale of the filters, so the sum runs over w², and
+    the smoothing meets the texture's own spectrum: that is the factor ρ, measured per pixel.
+
+    All this is said of monomials. A centred square is one less a share of the constant, and K differs between the two:
+    the difference is the terms, of the lower triangle (a >= b) alone, the same ones for every solution.
+    """
+
+    def factor(one: tuple[int, ...], two: tuple[int, ...]) -> float:
+        value = 1.0
+        for name, m, n in zip(AXES, one, two, strict=True):
+            axis = sampling.axis(name)
+            value *= _pixel_factor(axis, m, n) if name in ("x", "y") else _series_factor(axis, name == solution, m, n)
+        return value
+
+    n = columns.n_flow
+    powers = [c.terms[0].exponents for c in columns.columns[:n]]
+    K = np.array([[factor(a, b) for b in powers] for a in powers])
+    shares: dict[int, list[tuple[int, float]]] = {}
+    for base, square, share in columns.at_centre:
+        shares.setdefault(square, []).append((base, share))
+    terms = []
+    for a in range(n):
+        for b in range(a + 1):
+            found: dict[tuple[int, int], float] = {}
+            # Column -> monomials, K between these, monomials -> columns whose J is known.
+            for (p, u), (q, v) in product([(a, 1.0), *shares.get(a, ())], [(b, 1.0), *shares.get(b, ())]):
+                for (c, r), (d, s) in product([(p, 1.0), *shares.get(p, ())], [(q, 1.0), *shares.get(q, ())]):
+                    sign = (-1.0) ** ((c != p) + (d != q))
+                    pair = (max(c, d), min(c, d))
+                    found[pair] = found.get(pair, 0.0) + sign * u * v * r * s * float(K[p, q])
+            found.pop((a, b))
+            terms += [NoiseTerm(a, b, *pair, value) for pair, value in found.items()]
+    return K, tuple(terms)
+
+
+def cross_noise(sampling: Sampling, columns: ColumnSet, first: str, second: str) -> tuple[NoiseTerm, ...]:
     """The covariances between two solutions that do not vanish by symmetry.
 
     ``∂/∂t`` of the disparity and ``∂/∂s`` of the motion are the same mixed derivative, measured twice from the same
@@ -182,7 +212,7 @@ def cross_noise(sampling: Sampling, columns: ColumnSet, first: str, second: str)
             a, b = columns.index(p, second), columns.index(q, first)
             base_a, base_b = columns.index(p), columns.index(q)
             if a is not None and b is not None and base_a is not None and base_b is not None:
-                terms.append(CrossTerm(a, b, base_a, base_b, value))
+                terms.append(NoiseTerm(a, b, base_a, base_b, value))
     return tuple(terms)
 
 
@@ -203,9 +233,8 @@ def shared_noise(
 
     found = []
     for column in columns.columns[: columns.n_flow]:
-        e = dict(zip(AXES, column.exponents, strict=True))
+        e = dict(zip(AXES, column.terms[0].exponents, strict=True))
         factor = share(sampling.sx, e["sx"], step[0]) * share(sampling.sy, e["sy"], step[1])
-        own_column = Column(column.channel, tuple(0 if a in ("sx", "sy") else e[a] for a in AXES))
-        at = own.columns.index(own_column) if own_column in own.columns and factor != 0 else -1
-        found.append((at, factor))
+        partner = own.index(column.channel, column.offset.replace("sx", "").replace("sy", "") or "1")
+        found.append((-1 if partner is None or factor == 0 else partner, factor))
     return found

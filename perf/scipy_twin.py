@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d  # type: ignore[import-untyped]
 
-from leafflow_ti.models import AXES, ColumnSet, TensorLayout
+from leafflow_ti.models import AXES, ColumnSet, Moment, TensorLayout
 from leafflow_ti.sampling import Sampling, column_noise
 
 Array = NDArray[np.float64]
@@ -39,16 +39,18 @@ def estimate(images: NDArray[np.float32], columns: ColumnSet, layout: TensorLayo
     maps = _products(images, columns, layout, sampling)
     after_products = time.perf_counter()
     tall = {}
-    for entry in layout.entries:
-        key, n = _key(entry.channels, entry.exponents), entry.exponents[AXES.index("y")]
+    for moment in layout.moments:
+        key, n = _key(moment), moment.exponents[AXES.index("y")]
         if (key, n) not in tall:
             tall[key, n] = _valid(correlate1d(maps[key], sampling.y.window(n), axis=0), 0, sampling.y.size // 2)
     after_y = time.perf_counter()
     planes = []
     for entry in layout.entries:
-        source = tall[_key(entry.channels, entry.exponents), entry.exponents[AXES.index("y")]]
-        window = sampling.x.window(entry.exponents[AXES.index("x")])
-        planes.append(_valid(correlate1d(source, window, axis=1), 1, sampling.x.size // 2))
+        plane = np.zeros(())
+        for moment, factor in entry:
+            window = factor * sampling.x.window(moment.exponents[AXES.index("x")])
+            plane = plane + correlate1d(tall[_key(moment), moment.exponents[AXES.index("y")]], window, axis=1)
+        planes.append(_valid(plane, 1, sampling.x.size // 2))
     after_x = time.perf_counter()
     parameters = _null_space(np.stack(planes, axis=-1), columns, layout, sampling)
     after_null_space = time.perf_counter()
@@ -63,9 +65,9 @@ def estimate(images: NDArray[np.float32], columns: ColumnSet, layout: TensorLayo
     )
 
 
-def _key(channels: tuple[str, str], exponents: tuple[int, ...]) -> tuple[tuple[str, str], tuple[int, ...]]:
+def _key(moment: Moment) -> tuple[tuple[str, str], tuple[int, ...]]:
     """A product image summed over cameras and frames: its channels and the powers of t, sy, sx."""
-    return channels, tuple(exponents[AXES.index(a)] for a in ("t", "sy", "sx"))
+    return moment.channels, tuple(moment.exponents[AXES.index(a)] for a in ("t", "sy", "sx"))
 
 
 def _valid(image: Array, axis: int, radius: int) -> Array:
@@ -85,11 +87,11 @@ def _products(
             out = _valid(out, place, sampling.axis(axis).filter_radius)
         channels[channel] = out
     maps: dict[object, Array] = {}
-    for pair in {entry.channels for entry in layout.entries}:
+    for pair in {moment.channels for moment in layout.moments}:
         product = channels[pair[0]] * channels[pair[1]]
-        for entry in layout.entries:
-            key = _key(entry.channels, entry.exponents)
-            if entry.channels == pair and key not in maps:
+        for moment in layout.moments:
+            key = _key(moment)
+            if moment.channels == pair and key not in maps:
                 weight = np.ones(())
                 for axis, power in zip(("t", "sy", "sx"), key[1], strict=True):
                     weight = np.multiply.outer(weight, sampling.axis(axis).window(power))

@@ -124,12 +124,7 @@ class Estimated:
         """Values and standard errors [rows, cols] of a named map."""
         from leafflow_ti.kernels.maps import Output
 
-        if name in MOTION_NAMES:
-            plane = Output.MOTION + MOTION_NAMES.index(name)
-        elif name.startswith("brightness_"):
-            plane = Output.BRIGHTNESS + self.problem.columns.solutions.index(name.removeprefix("brightness_"))
-        else:
-            plane = Output[name.upper()]
+        plane = Output.MOTION + MOTION_NAMES.index(name) if name in MOTION_NAMES else Output[name.upper()]
         return self.planes[plane], self.planes[Output.STD + plane]
 
     @property
@@ -155,6 +150,7 @@ class Bench:
     model: str = ""
     valid: np.ndarray | None = None  # [t, y, x]
     brightness: str = "none"
+    brightness_terms: str = "none"
 
     @cached_property
     def layout(self) -> TensorLayout:
@@ -172,7 +168,7 @@ class Bench:
     def own_columns(self) -> tuple[Sampling, ColumnSet]:
         """Sampling and data vector of one camera's own flow."""
         sampling = Sampling(self.sampling.x, self.sampling.y, t=self.sampling.t)
-        return sampling, column_set(OWN_FLOW, self.brightness, (), sampling.sampled)
+        return sampling, column_set(OWN_FLOW, self.brightness, (), sampling.sampled, self.brightness_terms)
 
     @cached_property
     def steps(self) -> tuple[tuple[int, int], ...]:
@@ -312,7 +308,10 @@ def bench(device: Callable[[str], Device]) -> MakeBench:
     """``bench(model, brightness, grid, precision)``: the scene as that model sees it."""
 
     @functools.cache
-    def make(model: str, brightness: str, grid: str, precision: str, stride: int = STRIDE, cols: int = COLS) -> Bench:
+    def make(
+        model: str, brightness: str, grid: str, precision: str,
+        stride: int = STRIDE, cols: int = COLS, terms: str = "none",
+    ) -> Bench:  # fmt: skip
         sampling = sampling_of(grid, MODELS[model].time, cameras=MODELS[model].cameras)
         band = Band.of(sampling, ROWS, cols, stride)
         scene = replace(SCENE, brightness=LIGHT if brightness != "none" else ())
@@ -321,8 +320,8 @@ def bench(device: Callable[[str], Device]) -> MakeBench:
             images = images[:, GRIDS[grid][0] // 2][:, None]
         if not MODELS[model].time:
             images = images[SCENE.n_frames // 2][None]
-        columns = column_set(MODELS[model], brightness, sampling.camera_axes, sampling.sampled)
-        return Bench(device(precision), images, sampling, columns, band, model, brightness=brightness)
+        columns = column_set(MODELS[model], brightness, sampling.camera_axes, sampling.sampled, terms)
+        return Bench(device(precision), images, sampling, columns, band, model, None, brightness, terms)
 
     return make
 

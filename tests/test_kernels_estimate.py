@@ -47,6 +47,7 @@ def test_parameters_equal_the_twin(bench: Callable, case: tuple[str, str, str], 
         J, rho = b.reference(*pixel)
         P, variance = chain.solve(J, b.columns, b.sampling, estimator)
         cov = chain.covariances(J, variance, b.columns, b.sampling, rho, DENOISE[estimator])
+        P, cov = chain.at_centre(P, cov, b.columns)
         std = np.sqrt([np.diag(cov[k, k]) for k in range(b.columns.n_time_like)])
         for result in found.values():
             assert result.status[pixel] == Status.OK
@@ -74,7 +75,7 @@ def test_maps_equal_the_twin(bench: Callable, case: tuple[str, str, str], precis
     model, _, grid = case
     b = bench(*case, precision)
     moving = MODELS[model].time and grid != "single"
-    motion = ("translation" if model == "affine-translation" else "rotation") if moving else None
+    motion = MODELS[model].motions[0] if moving else None
     assert_maps_equal(b, b.estimate(motion, weighted=weighted))
 
 

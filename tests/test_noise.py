@@ -33,10 +33,12 @@ DISTANCE = 17  # px: windows of 11 and filters of 5 pixels do not overlap, so th
 
 
 @functools.cache
-def estimates(make_bench: Callable, model: str, estimator: str) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+def estimates(
+    make_bench: Callable, model: str, estimator: str, light: tuple[str, str] = ("none", "none")
+) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
     """Over seeds and places: parameters [n, places, m], predicted standard deviations likewise, noise variances."""
     sampling = conftest.sampling_of("line-x", True)
-    columns = column_set(MODELS[model], "none", sampling.camera_axes, sampling.sampled)
+    columns = column_set(MODELS[model], light[0], sampling.camera_axes, sampling.sampled, light[1])
     names = [f"{axis}: {c.channel}{c.offset}" for axis in columns.solutions for c in columns.columns[: columns.n_flow]]
     halo = sampling.x.radius + sampling.x.filter_radius
     size = (DISTANCE + 1 + 2 * halo, DISTANCE + 1 + 2 * halo)
@@ -52,6 +54,7 @@ def estimates(make_bench: Callable, model: str, estimator: str) -> tuple[list[st
             cov = chain.covariances(
                 bench.tensor(*place), result.variance[place], columns, sampling, smooth / energy, DENOISE[estimator]
             )
+            _, cov = chain.at_centre(result.parameters[place].T, cov, columns)
             std.append(np.concatenate([np.sqrt(np.diag(cov[k, k])) for k in range(columns.n_time_like)]))
         found.append([result.parameters[place].ravel() for place in PLACES])
         predicted.append(std)
@@ -60,14 +63,22 @@ def estimates(make_bench: Callable, model: str, estimator: str) -> tuple[list[st
 
 
 @pytest.mark.parametrize("estimator", ["ols", "tls-equilibrated"])
-@pytest.mark.parametrize("model", ["affine", "affine-4d"])
-def test_predicted_standard_deviations_are_the_empirical_ones(make_bench: Callable, model: str, estimator: str) -> None:
+@pytest.mark.parametrize(
+    ("model", "light"), [("affine", ("none", "none")), ("affine-4d", ("none", "none")), ("affine", ("spatial", "both"))]
+)
+def test_predicted_standard_deviations_are_the_empirical_ones(
+    make_bench: Callable, model: str, estimator: str, light: tuple[str, str]
+) -> None:
     """160 samples about 4 means know a standard deviation to 1 / sqrt(2 * 156) = 6 %, so .7 to 1.4 is five of these
-    standard errors: that much more than chance is left to the approximations of the covariance."""
-    names, found, predicted, _ = estimates(make_bench, model, estimator)
+    standard errors: that much more than chance is left to the approximations of the covariance. ρ is that of the
+    gradient; of the image itself, which brightness is measured by, one more smoothing leaves nearly all, so that the
+    errors of brightness are underrated by up to the square root of ρ, here .75."""
+    names, found, predicted, _ = estimates(make_bench, model, estimator, light)
     empirical = np.sqrt(np.mean(np.var(found, axis=0, ddof=1), axis=0))
     ratio = np.sqrt(np.mean(predicted**2, axis=(0, 1))) / empirical
-    assert all(0.7 <= r <= 1.4 for r in ratio), dict(zip(names, ratio.round(2).tolist(), strict=True))
+    lowest = [0.5 if ": i" in name else 0.7 for name in names]
+    named = dict(zip(names, ratio.round(2).tolist(), strict=True))
+    assert all(low <= r <= 1.4 for low, r in zip(lowest, ratio, strict=True)), named
 
 
 @pytest.mark.parametrize("estimator", ["ols", "tls-equilibrated"])

@@ -20,7 +20,7 @@ Model = Annotated[
     str | None,
     _text(
         "model",
-        "auto|flow|flow-affine|depth|affine-translation|affine|affine-4d|affine-5d",
+        "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d",
         "What is estimated [auto: affine-4d for a line of cameras, affine-5d for a 2D grid, depth without time, "
         "flow-affine for one camera].",
     ),
@@ -31,6 +31,9 @@ Motion = Annotated[
 Rows = Annotated[str | None, _text("rows", "auto|2d[+b5][+as][+at]", "Flow parameters that enter the 3D fit [auto].")]
 Brightness = Annotated[
     str | None, _text("brightness", "none|temporal|spatial|camera", "Brightness changes that are modelled [none].")
+]
+BrightnessTerms = Annotated[
+    str | None, _text("brightness-terms", "none|time|space|both", "Second-order terms of the brightness [none].")
 ]
 Estimator = Annotated[
     str | None, _text("estimator", "ols|tls|tls-equilibrated", "Estimator of the flow parameters [tls-equilibrated].")

@@ -39,6 +39,7 @@ def run(
     motion: options.Motion = None,
     rows: options.Rows = None,
     brightness: options.Brightness = None,
+    brightness_terms: options.BrightnessTerms = None,
     estimator: options.Estimator = None,
     solver: options.Solver = None,
     weighting: options.Weighting = None,

@@ -84,6 +84,14 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                     for i in range(lanes):
                         element[i] -= own * quietest[i]
                 small.store(ws, clean + tri(r, c) * stride, element)
+        terms = number[Number.NOISE_TERMS]
+        extra = Value.RATIO + number[Number.SOLUTIONS] * (flow * (flow + 1) // 2) + which * terms
+        for term in range(terms):
+            at = Number.LOWER + tri(number[Number.N], 0) + 2 * term
+            begin = number[at + 1] * n_pixels + pixel
+            own = noise + number[at] * stride
+            for i in range(lanes):
+                ws[own + i] += value[extra + term] * ti.cast(J[begin + i], precise)
         least = ti.Vector.zero(precise, lanes)
         for i in range(lanes):
             least[i] = ti.max(ws[floor + i] + precise(1e-3) * quietest[i], precise(1e-30))
@@ -109,6 +117,14 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
                             - value[Value.SHIFT + k]
                         )
                         ws[at + i] += value[Value.SCALE + column] * shift
+        for term in range(number[Number.CENTRE_TERMS]):
+            constant, square = number[Number.CENTRE + 2 * term], number[Number.CENTRE + 2 * term + 1]
+            share = value[Value.CENTRE + term] * value[Value.SCALE + square]
+            for c in range(n_rows):
+                if number[rows_at + c] == constant:
+                    at = response_at + (square * n_rows + c) * stride
+                    for i in range(lanes):
+                        ws[at + i] = share
         small.cholesky(ws, clean, flow, floor, stride)
         small.solve(ws, clean, response_at, flow, n_rows, stride)
         small.symmetric_times(ws, noise, response_at, product, flow, n_rows, stride)

@@ -22,10 +22,18 @@ class Output(IntEnum):
     MOTION = 4  # 9: velocity, rotation, acceleration
     FLOW_X = 13
     FLOW_Y = 14
-    BRIGHTNESS = 15  # 3, in the order of the solutions
-    STD = 18
-    STATUS = 36
-    PLANES = 37
+    BRIGHTNESS_T = 15
+    BRIGHTNESS_TX = 16
+    BRIGHTNESS_TY = 17
+    BRIGHTNESS_TT = 18
+    BRIGHTNESS_SX = 19
+    BRIGHTNESS_SY = 20
+    BRIGHTNESS_WORLD_X = 21
+    BRIGHTNESS_WORLD_Y = 22
+    BRIGHTNESS_WORLD_TT = 23
+    STD = 24
+    STATUS = 48
+    PLANES = 49
 
 
 @functools.cache
@@ -92,6 +100,51 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
         return result
 
     @ti.func
+    def parameter(base: ti.i32, row: ti.i32, stride: ti.i32, number: ti.template()) -> ti.i32:
+        """Where the parameter of a motion row lies."""
+        column = number[Number.MOTION_SOLUTION] * number[Number.FLOW] + number[Number.MOTION_ROWS + row]
+        return base + (number[Region.PARAMETERS] + column) * stride
+
+    @ti.func
+    def world(
+        base: ti.i32, at: ti.i32, i: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        number: ti.template(), value: ti.template(), ws: ti.template(), out: ti.template(),
+    ):  # fmt: skip
+        """Brightness changes of the material (4.28): slopes along X and Y, and the trend without what moves past.
+
+        All are linear in the image's slopes and trend; the weights' own errors, of geometry and motion, are left out.
+        The motion is the one that the reference model's rows give.
+        """
+        g = base + number[Region.GEOMETRY] * stride + i
+        q = base + number[Region.MOTION] * stride + i
+        rows = base + number[Region.COV_T] * stride + i
+        ray = patch.pixel_ray(at, number, value)
+        s = patch.surface(ray, value[Value.F], ws[g], ws[g + stride], ws[g + 2 * stride])
+        # Inverse of [∂X/∂x ∂Y/∂x; ∂X/∂y ∂Y/∂y] (5.8): its determinant is (Z0 / f)² / c.
+        weight = ti.Matrix.zero(precise, 3, 3)
+        weight[0, 0], weight[0, 1] = 1 - s[1] * ray[0], -s[1] * ray[1]
+        weight[1, 0], weight[1, 1] = -s[2] * ray[0], 1 - s[2] * ray[1]
+        weight *= value[Value.F] / s[0]
+        if number[Number.WORLD_MAPS] == 3:
+            n = ti.Vector([ws[q], ws[q + stride], ws[q + 2 * stride]], dt=precise)
+            Zt = n[2] - s[1] * n[0] - s[2] * n[1]
+            for k in ti.static(range(2)):
+                past = Zt / s[3] * ray[k] - n[k]  # the surface point seen at the pixel, relative to the material
+                for m in ti.static(range(2)):
+                    weight[2, m] -= past * weight[k, m]
+            weight[2, 2] = 1
+        first = number[Number.WORLD_ROW]
+        for k in range(number[Number.WORLD_MAPS]):
+            result = precise(0.0)
+            variance = precise(0.0)
+            for r in range(number[Number.WORLD_MAPS]):
+                result -= weight[k, r] * ws[parameter(base, first + r, stride, number) + i]
+                for c in range(number[Number.WORLD_MAPS]):
+                    spread = ws[rows + tri(first + ti.max(r, c), first + ti.min(r, c)) * stride]
+                    variance += weight[k, r] * weight[k, c] * spread
+            put(out, Output.BRIGHTNESS_WORLD_X + k, at, n_pixels, result, variance)
+
+    @ti.func
     def measured(
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
@@ -138,14 +191,18 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
                     row = k * number[Number.OFFSETS]
                     p = base + (number[Region.PARAMETERS] + solution * flow + number[Number.FLOW_ROWS + k]) * stride + i
                     put(out, Output.FLOW_X + k, at, n_pixels, ws[p], ws[rows + tri(row, row) * stride])
-            for j in range(number[Number.SOLUTIONS]):
-                if number[Number.BRIGHTNESS_COLUMN] >= 0:
+            if number[Number.BRIGHTNESS_COLUMN] >= 0:
+                for j in range(number[Number.CAMERA_SOLUTIONS]):
                     p = base + (number[Region.PARAMETERS] + j * flow + number[Number.BRIGHTNESS_COLUMN]) * stride + i
                     variance = ws[base + (number[Region.BRIGHTNESS_VARIANCE] + j) * stride + i]
-                    if j == solution:
-                        last = number[Number.ROWS_T] - 1
-                        variance = ws[rows + tri(last, last) * stride]
-                    put(out, Output.BRIGHTNESS + j, at, n_pixels, -ws[p], variance)
+                    put(out, Output.BRIGHTNESS_SX + number[Number.CAMERA_AXIS + j], at, n_pixels, -ws[p], variance)
+            for j in range(number[Number.BRIGHTNESS_ROWS]):
+                row = 2 * number[Number.OFFSETS] + j
+                p = parameter(base, row, stride, number)
+                plane = Output.BRIGHTNESS_T + number[Number.BRIGHTNESS_PLANES + j]
+                put(out, plane, at, n_pixels, -ws[p + i], ws[rows + tri(row, row) * stride])
+            if number[Number.WORLD_MAPS] > 0:
+                world(base, at, i, stride, n_pixels, number, value, ws, out)
 
     @ti.func
     def motion(

@@ -21,7 +21,7 @@ ROUNDS = 4
 @functools.cache
 def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``load``, ``least_squares``, ``factorise``, ``accept``, ``inverse_iteration``, ``jacobi``,
-    ``parameters`` and ``residuals``."""
+    ``parameters``, ``residuals`` and ``centre``."""
     precise, lanes = spec.precise, spec.lanes
     small = dense(spec)
 
@@ -306,5 +306,19 @@ def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
                 energy[i] /= ws[at + i]
             small.store(ws, at, energy)
 
-    stages = (load, least_squares, factorise, accept, inverse_iteration, jacobi, parameters, residuals)
+    @ti.func
+    def centre(
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
+        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+    ):  # fmt: skip
+        """Parameters of constants become values at the window's centre, where centred squares are not 0."""
+        for j in range(number[Number.SOLUTIONS]):
+            first = base + (number[Region.PARAMETERS] + j * number[Number.FLOW]) * stride
+            for term in range(number[Number.CENTRE_TERMS]):
+                at = first + number[Number.CENTRE + 2 * term] * stride
+                square = first + number[Number.CENTRE + 2 * term + 1] * stride
+                for i in range(lanes):
+                    ws[at + i] += value[Value.CENTRE + term] * ws[square + i]
+
+    stages = (load, least_squares, factorise, accept, inverse_iteration, jacobi, parameters, residuals, centre)
     return SimpleNamespace(**{f.__name__: batch_kernel(spec, f) for f in stages})

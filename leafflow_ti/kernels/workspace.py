@@ -19,6 +19,7 @@ BLOCK = 4
 MAX_UNKNOWNS = 9
 MAX_ROWS = 16
 MAX_COLUMNS = 32
+MAX_SQUARES = 8
 
 
 class Region(IntEnum):
@@ -163,13 +164,18 @@ class Number(IntEnum):
     TERMS = auto()  # G: geometry terms (1, x, y, t), 0 without a grid
     OFFSETS = auto()  # number of motion offsets
     ROWS_S = auto()  # rows of a camera solution: 2 G, and one for brightness if the model has it
-    ROWS_T = auto()  # rows of the motion solution: 2 OFFSETS, and one for brightness
+    ROWS_T = auto()  # rows of the motion solution: 2 OFFSETS + BRIGHTNESS_ROWS
     USE_RANGE = auto()
     UNKNOWNS = auto()  # of the motion fit; 0 without one
     WEIGHTED = auto()  # weighted least squares, else plain
     OWN_FLOW = auto()  # the tables of one camera's own flow, not of the reference model
     CORRELATED = auto()  # columns of the reference model whose noise other cameras share; 0 without them
     BRIGHTNESS_COLUMN = auto()  # column of I, or -1
+    BRIGHTNESS_ROWS = auto()  # brightness rows of the motion solution, behind its flow rows
+    WORLD_ROW = auto()  # the first of its rows of IΔx, IΔy, IΔt
+    WORLD_MAPS = auto()  # brightness in world coordinates: 2 along X, Y; 3 with the trend; 0 without slopes
+    CENTRE_TERMS = auto()  # what centred squares add to the value at the window's centre
+    NOISE_TERMS = auto()  # terms of each solution's noise beyond the ratios
     CROSS_TERMS = auto()  # per pair (camera solution, motion)
     RANGE_TERM = auto()  # index of t among the geometry terms
     CAMERA_SOLUTIONS = auto()  # number of solutions along camera axes
@@ -184,9 +190,12 @@ class Number(IntEnum):
     CAMERA_ROWS = MOTION_ROWS + MAX_ROWS  # 2 x MAX_ROWS: columns of the geometry rows per camera solution
     CAMERA_AXIS = CAMERA_ROWS + 2 * MAX_ROWS  # 2: 0 for sx, 1 for sy
     CROSS_AB = CAMERA_AXIS + 2  # 2 x 9 x 3: a, b, plane of J
-    MOVE = CROSS_AB + 54  # 2 x 2: columns of the flow's derivatives along x, y
+    BRIGHTNESS_PLANES = CROSS_AB + 54  # 4: output plane of each brightness row, from BRIGHTNESS_T on
+    CENTRE = BRIGHTNESS_PLANES + 4  # MAX_SQUARES x 2: column of the constant, column of the square
+    MOVE = CENTRE + 2 * MAX_SQUARES  # 2 x 2: columns of the flow's derivatives along x, y
     PARTNER = MOVE + 4  # MAX_COLUMNS: column of an own flow for each column of the reference model, or -1
     LOWER = PARTNER + MAX_COLUMNS  # N (N + 1) / 2: plane of each element of the lower triangle
+    # Behind them NOISE_TERMS x 2: element of the lower triangle, plane of J.
 
 
 class Value(IntEnum):
@@ -213,8 +222,9 @@ class Value(IntEnum):
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9
-    PARTNER = CROSS + 18  # MAX_COLUMNS: factor of the noise shared with each column of the reference model
-    RATIO = PARTNER + MAX_COLUMNS  # k x packed [F]
+    CENTRE = CROSS + 18  # MAX_SQUARES: factors
+    PARTNER = CENTRE + MAX_SQUARES  # MAX_COLUMNS: factor of the noise shared with each column of the reference model
+    RATIO = PARTNER + MAX_COLUMNS  # k x packed [F], then k x NOISE_TERMS
 
 
 @functools.cache
@@ -235,8 +245,8 @@ def batch_kernel(spec: KernelSpec, body):
         stride: ti.i32,
         which: ti.i32,
         n_tasks: ti.i32,
-        number_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [Number.LOWER + N (N + 1) / 2]
-        value_in: ti.types.ndarray(dtype=precise, ndim=1),  # [Value.RATIO + k F (F + 1) / 2]
+        number_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [Number.LOWER + N (N + 1) / 2 + 2 NOISE_TERMS]
+        value_in: ti.types.ndarray(dtype=precise, ndim=1),  # [Value.RATIO + k (F (F + 1) / 2 + NOISE_TERMS)]
         J_in: ti.types.ndarray(dtype=real, ndim=1),  # [n_planes * n_pixels]
         ws_io: ti.types.ndarray(dtype=precise, ndim=1),  # [n_groups * n_elements * lanes]
         map_out: ti.types.ndarray(dtype=real, ndim=1),  # [n_maps * n_pixels]

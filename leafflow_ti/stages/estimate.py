@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from leafflow_ti.models import AXES, Column, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import (
+    NoiseTerm,
     Sampling,
     column_noise,
     cross_noise,
@@ -100,6 +101,20 @@ class Problem:
         return tuple(o for o in ("1", "x", "y", "t") if self.columns.index("x", o) is not None)
 
     @property
+    def brightness(self) -> tuple[str, ...]:
+        """Offsets of the brightness change in time that are measured."""
+        if "t" not in self.columns.solutions:
+            return ()
+        return tuple(o for o in ("1", "x", "y", "t") if self.columns.index("i", o) is not None)
+
+    @property
+    def world_brightness(self) -> tuple[str, ...]:
+        """Of these, the ones that geometry (for the slopes) and motion (for the trend) carry into the world (4.28)."""
+        if not {"x", "y"} <= {*self.brightness} & {*self.terms}:
+            return ()
+        return tuple(o for o in self.brightness if o in ("x", "y") or (o == "t" and self.unknowns))
+
+    @property
     def camera_axes(self) -> tuple[str, ...]:
         """Camera axes with a solution."""
         return tuple(a for a in self.columns.solutions if a != "t")
@@ -114,6 +129,27 @@ def unknowns_of(motion: str, columns: ColumnSet) -> int:
     if columns.index("x", "x") is None:
         return 2
     return {"translation": 3, "rotation": 6, "acceleration": 8}[motion]
+
+
+BRIGHTNESS_MAPS = {"1": "brightness_t", "x": "brightness_tx", "y": "brightness_ty", "t": "brightness_tt"}
+WORLD_MAPS = {"x": "brightness_world_x", "y": "brightness_world_y", "t": "brightness_world_tt"}
+"""Offset of the brightness change in time -> name of its map, in the image and on the material."""
+
+
+def _solution_noise(
+    sampling: Sampling, columns: ColumnSet, scale: NDArray[np.float64]
+) -> tuple[list[NDArray[np.float64]], tuple[NoiseTerm, ...]]:
+    """Each solution's noise: ratios (packed), then the values of the terms that centred squares add; and the terms."""
+    lower = np.tril_indices(columns.n_flow)
+    found = [noise_ratio(sampling, columns, a) for a in columns.solutions]
+    values = [np.array([t.value * scale[t.a] * scale[t.b] for t in terms]) for _, terms in found]
+    return [*(ratio[lower] for ratio, _ in found), *values], found[0][1]
+
+
+def _packed(a: int, b: int) -> int:
+    """Position of an element of a symmetric matrix in its packed lower triangle."""
+    r, c = max(a, b), min(a, b)
+    return r * (r + 1) // 2 + c
 
 
 @dataclass(frozen=True)
@@ -181,19 +217,18 @@ class EstimateStage:
         self._maps = device.empty(Output.PLANES * n_pixels)
 
     def _rows(self) -> SimpleNamespace:
-        """Columns of the motion rows and of each camera solution's geometry rows; a brightness row stands last."""
+        """Columns of the motion rows and of each camera solution's geometry rows; brightness rows stand last."""
         problem, columns = self.problem, self.problem.columns
-        last = [i for i in [columns.index("i")] if i is not None]
 
-        def both(own: str, offsets: Sequence[str]) -> list[int]:
+        def both(own: str, offsets: Sequence[str], brightness: Sequence[str]) -> list[int]:
             other = "y" if own == "x" else "x"
             found = [columns.index(c, o) for c in (own, other) for o in offsets]
-            return [i for i in found if i is not None] + last
+            found += [columns.index("i", o) for o in brightness]
+            return [i for i in found if i is not None]
 
-        motion = both("x", problem.offsets) if "t" in columns.solutions else []
-        return SimpleNamespace(
-            motion=motion, camera=[both("x" if a == "sx" else "y", problem.terms) for a in problem.camera_axes]
-        )
+        motion = both("x", problem.offsets, problem.brightness) if "t" in columns.solutions else []
+        camera = [both("x" if a == "sx" else "y", problem.terms, ["1"]) for a in problem.camera_axes]
+        return SimpleNamespace(motion=motion, camera=camera)
 
     @staticmethod
     def _set_numbers(number: NDArray[np.int32], **entries: int) -> None:
@@ -210,22 +245,29 @@ class EstimateStage:
         from leafflow_ti.kernels.workspace import Number, Region, Value
 
         problem, precision = self.problem, self.device.algebra
-        number = np.full(Number.LOWER + len(layout.lower), -1, np.int32)
-        value = np.zeros(Value.RATIO + columns.n_time_like * columns.n_flow * (columns.n_flow + 1) // 2)
+        noise = column_noise(sampling, columns)
+        ratios, terms = _solution_noise(sampling, columns, noise**-0.5)
+        number = np.full(Number.LOWER + len(layout.lower) + 2 * len(terms), -1, np.int32)
+        value = np.concatenate([np.zeros(Value.RATIO), *ratios])
         number[: len(Region)] = self.layout.offsets
         self._set_numbers(
             number, N=columns.n, SOLUTIONS=columns.n_time_like, FLOW=columns.n_flow, ITERATIONS=problem.iterations,
             MOTION_SOLUTION=columns.n_time_like - 1 if "t" in columns.solutions else -1, TERMS=len(problem.terms),
             OFFSETS=len(offsets), ROWS_T=len(rows), ROWS_S=0, USE_RANGE=0, UNKNOWNS=0, WEIGHTED=problem.weighted,
-            BRIGHTNESS_COLUMN=-1, RANGE_TERM=-1, CAMERA_SOLUTIONS=0, CROSS_TERMS=0, OWN_FLOW=0, CORRELATED=0,
-            EXTRA=len(layout.entries),
+            BRIGHTNESS_COLUMN=-1, BRIGHTNESS_ROWS=0, WORLD_MAPS=0, RANGE_TERM=-1, CAMERA_SOLUTIONS=0, CROSS_TERMS=0,
+            OWN_FLOW=0, CORRELATED=0, EXTRA=len(layout.entries), CENTRE_TERMS=len(columns.at_centre),
+            NOISE_TERMS=len(terms),
         )  # fmt: skip
-        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = [columns.columns.index(Column(c)) for c in ("x", "y")]
+        for j, (constant, square, factor) in enumerate(columns.at_centre):
+            number[Number.CENTRE + 2 * j : Number.CENTRE + 2 * j + 2] = constant, square
+            value[Value.CENTRE + j] = factor
+        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = [columns.columns.index(Column.of(c)) for c in ("x", "y")]
         for i, o in enumerate(offsets):
             number[Number.OFFSET_CODES + i] = 0 if o == "1" else 1 + AXES.index(o)
         number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows)] = rows
-        number[Number.LOWER :] = layout.lower
-        noise = column_noise(sampling, columns)
+        lower = Number.LOWER + len(layout.lower)
+        number[Number.LOWER : lower] = layout.lower
+        number[lower:] = [n for t in terms for n in (_packed(t.a, t.b), layout.lower[_packed(t.base_a, t.base_b)])]
         value[Value.RIDGE], value[Value.GAP], value[Value.STEP_SIZE] = (t[precision] for t in (RIDGE, GAP, STEP_SIZE))
         value[Value.SCALE : Value.SCALE + columns.n] = noise**-0.5
         value[Value.NOISE : Value.NOISE + columns.n] = noise
@@ -235,17 +277,15 @@ class EstimateStage:
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
         for code, name in enumerate(("1", *AXES, "range")):
             value[Value.MODEL_ERROR + code] = MODEL_ERROR[name]
-        assert RANGE_CODE == len(AXES) + 1
+        assert len(AXES) + 1 == RANGE_CODE
         value[Value.SECOND_MOMENT : Value.SECOND_MOMENT + 2] = sampling.x.moment(2), sampling.y.moment(2)
         # Windows that do not overlap from one frame to the next share no content that could be followed.
         value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size)
         value[Value.DENOISE] = DENOISE[problem.estimator]
-        lower = np.tril_indices(columns.n_flow)
-        ratios = [noise_ratio(sampling, columns, a)[lower] for a in columns.solutions]
-        value[Value.RATIO :] = np.concatenate(ratios)
         return _Tables(number, value)
 
     def _reference_tables(self, rows: SimpleNamespace, layout: TensorLayout) -> _Tables:
+        from leafflow_ti.kernels.maps import Output
         from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Value
 
         problem, columns, sampling = self.problem, self.problem.columns, self.problem.sampling
@@ -255,9 +295,12 @@ class EstimateStage:
         self._set_numbers(
             number, ROWS_S=len(rows.camera[0]) if rows.camera else 0, USE_RANGE=problem.use_range,
             UNKNOWNS=problem.fitted, BRIGHTNESS_COLUMN=-1 if brightness is None else brightness,
+            BRIGHTNESS_ROWS=len(problem.brightness), WORLD_ROW=2 * len(problem.offsets) + 1,
+            WORLD_MAPS=len(problem.world_brightness), CAMERA_SOLUTIONS=len(problem.camera_axes),
             RANGE_TERM=problem.terms.index("t") if "t" in problem.terms else -1,
-            CAMERA_SOLUTIONS=len(problem.camera_axes),
         )  # fmt: skip
+        planes = [Output[BRIGHTNESS_MAPS[o].upper()] - Output.BRIGHTNESS_T for o in problem.brightness]
+        number[Number.BRIGHTNESS_PLANES : Number.BRIGHTNESS_PLANES + len(planes)] = planes
         for k, axis in enumerate(problem.camera_axes):
             number[Number.CAMERA_AXIS + k] = 0 if axis == "sx" else 1
             at = Number.CAMERA_ROWS + k * MAX_ROWS
@@ -265,9 +308,8 @@ class EstimateStage:
             terms = cross_noise(sampling, columns, axis, "t") if "t" in columns.solutions else ()
             number[Number.CROSS_TERMS] = len(terms)
             for j, term in enumerate(terms):
-                r, c = max(term.base_a, term.base_b), min(term.base_a, term.base_b)
                 at = Number.CROSS_AB + (k * 9 + j) * 3
-                number[at : at + 3] = term.a, term.b, layout.lower[r * (r + 1) // 2 + c]
+                number[at : at + 3] = term.a, term.b, layout.lower[_packed(term.base_a, term.base_b)]
                 value[Value.CROSS + k * 9 + j] = term.value
         return tables
 

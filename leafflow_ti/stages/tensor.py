@@ -23,7 +23,7 @@ from leafflow_ti.stages.planes import Filtering, Terms, round_up
 
 EXTRA_PLANES = 4
 """Behind the tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
-OUTPUT_PLANES = 37
+OUTPUT_PLANES = 49
 _CAMERA = ("sy", "sx")
 _PASSES = ("t", "sy", "sx", "y", "x")
 _MASS, _ENERGY, _SMOOTH, _LEVEL = ((name, (0, 0)) for name in ("mass", "energy", "smooth", "level"))
@@ -68,9 +68,9 @@ def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, ban
     channels = len(columns.channels)
     samples = sampling.sx.size * sampling.sy.size
     s, t = (AXES.index("sx"), AXES.index("sy")), AXES.index("t")
-    maps = {(e.channels, e.exponents[s[0]], e.exponents[s[1]]) for e in layout.entries}
-    sums = {(e.channels, e.exponents[s[0]], e.exponents[s[1]], e.exponents[t]) for e in layout.entries}
-    tall = {(e.channels, e.exponents[1:]) for e in layout.entries}
+    maps = {(m.channels, m.exponents[s[0]], m.exponents[s[1]]) for m in layout.moments}
+    sums = {(m.channels, m.exponents[s[0]], m.exponents[s[1]], m.exponents[t]) for m in layout.moments}
+    tall = {(m.channels, m.exponents[1:]) for m in layout.moments}
     extra = EXTRA_PLANES
     scratch = max(2 * cameras, 3 * samples * channels)
     wide = (
@@ -201,13 +201,13 @@ class TensorStage:
         centre = (self.cameras[0] // 2, self.cameras[1] // 2)
         outputs: dict[Any, list[tuple[tuple[int, int], float]]] = {}
         tap = self.n_taps // 2
-        for entry in layout.entries:
-            powers = (entry.exponents[AXES.index("sy")], entry.exponents[AXES.index("sx")])
-            key = (entry.channels, powers)
+        for moment in layout.moments:
+            powers = (moment.exponents[AXES.index("sy")], moment.exponents[AXES.index("sx")])
+            key = (moment.channels, powers)
             if key in outputs:
                 continue
             weights = [sampling.axis(a).window(p) for a, p in zip(_CAMERA, powers, strict=True)]
-            a, b = (None if c == "i" else c for c in entry.channels)
+            a, b = (None if c == "i" else c for c in moment.channels)
             terms = []
             for (iy, wy), (ix, wx) in product(enumerate(weights[0]), enumerate(weights[1])):
                 where = (tap, centre[0] + iy - len(weights[0]) // 2, centre[1] + ix - len(weights[1]) // 2)
@@ -236,19 +236,21 @@ class TensorStage:
         x, y, t = (AXES.index(a) for a in ("x", "y", "t"))
         summed: dict[Any, int] = {}
         tall: dict[Any, int] = {}
-        final: list[tuple[int, int]] = []
+        # Of every output plane: the tall planes that it is made of, and the window along x that each is convolved with.
+        final: list[dict[int, NDArray[np.float64]]] = []
 
-        def add(key: Any, q: int, n: int, m: int) -> None:
+        def column_sum(key: Any, q: int, n: int) -> int:
             one = summed.setdefault((key, q), len(summed))
-            two = tall.setdefault((one, n), len(tall))
-            final.append((two, m))
+            return tall.setdefault((one, n), len(tall))
 
         for entry in layout.entries:
-            e = entry.exponents
-            powers = (e[AXES.index("sy")], e[AXES.index("sx")])
-            add((entry.channels, powers), e[t], e[y], e[x])
-        for extra in (_MASS, _ENERGY, _SMOOTH, _LEVEL):
-            add(extra, 0, 0, 0)
+            windows: dict[int, NDArray[np.float64]] = {}
+            for moment, factor in entry:
+                e = moment.exponents
+                two = column_sum((moment.channels, (e[AXES.index("sy")], e[AXES.index("sx")])), e[t], e[y])
+                windows[two] = windows.get(two, np.zeros(1)) + factor * sampling.x.window(e[x])
+            final.append(windows)
+        final += [{column_sum(extra, 0, 0): sampling.x.window(0)} for extra in (_MASS, _ENERGY, _SMOOTH, _LEVEL)]
         n_t = sampling.t.size
         self._sums = []
         for newest in range(n_t):
@@ -284,10 +286,11 @@ class TensorStage:
             [
                 [
                     (two * rows * self.pitch + lead_x * (two not in displaced) + r, float(w))
-                    for r, w in enumerate(sampling.x.window(m))
+                    for two, window in windows.items()
+                    for r, w in enumerate(window)
                     if w
                 ]
-                for two, m in final
+                for windows in final
             ],
             rows, self.out_pitch, self.pitch, band.stride,
         )  # fmt: skip

@@ -3,6 +3,8 @@
 Only the tables (columns, filters, noise factors) come from the library.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import correlate1d, minimum_filter
 
@@ -49,14 +51,35 @@ def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels, val
         window = tuple(slice(where[a] - half[a], where[a] + half[a] + 1) for a in ARRAY_AXIS)
         d = []
         for column in columns.columns:
-            value = channels[column.channel][window].copy()
-            for a, e in zip(AXES, column.exponents, strict=True):
-                value *= grids[a] ** e
-            d.append(value.ravel())
-        d = np.array(d)
-        counted = weight * seen[window[0], None, None, window[3], window[4]]
-        result.append((d * counted.ravel()) @ d.T)
+            d.append({})
+            for term in column.terms:
+                value = term.factor * channels[term.channel][window]
+                for a, e in zip(AXES, term.exponents, strict=True):
+                    value *= grids[a] ** e
+                d[-1][term.vector] = d[-1].get(term.vector, 0.0) + value.ravel()
+        counted = (weight * seen[window[0], None, None, window[3], window[4]]).ravel()
+        J = np.zeros((columns.n, columns.n))
+        for vector in {v for values in d for v in values}:
+            one = np.array([values.get(vector, np.zeros(counted.size)) for values in d])
+            J += (one * counted) @ one.T
+        result.append(J)
     return np.array(result)
+
+
+def shares(columns: ColumnSet):
+    """Matrix [n_flow, n_flow] by which the columns come from monomials: 1, and what centring takes off."""
+    flow = columns.columns[: columns.n_flow]
+    T = np.eye(columns.n_flow)
+    for i, column in enumerate(flow):
+        for term in column.terms[1:]:
+            T[i, [c.terms[0] for c in flow].index(replace(term, factor=1.0))] = term.factor
+    return T
+
+
+def at_centre(P, cov, columns: ColumnSet):
+    """Parameters [n_flow, k] and covariances of monomials instead of centred columns: the values at the centre."""
+    T = shares(columns)
+    return T.T @ P, T.T @ cov @ T
 
 
 def texture_smoothness(images, sampling: Sampling, x, y):
@@ -96,6 +119,14 @@ def noise_variance(J, P, columns: ColumnSet, noise):
     return np.einsum("ik,ij,jk->k", full, J, full) / np.einsum("ik,i,ik->k", full, noise, full)
 
 
+def solution_noise(J, columns: ColumnSet, sampling: Sampling, solution):
+    """Noise [n_flow, n_flow] of the normal equations of one solution, per σ² ρ; the ratios are those of monomials."""
+    T = shares(columns)
+    R = np.linalg.inv(T)
+    n = columns.n_flow
+    return T @ (R @ J[:n, :n] @ R.T * noise_ratio(sampling, columns, solution)[0]) @ T.T
+
+
 def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, denoise=0.9):
     """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions.
 
@@ -109,7 +140,7 @@ def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, d
         for j, two in enumerate(columns.solutions):
             M = np.zeros((n, n))
             if i == j:
-                M = J[:n, :n] * noise_ratio(sampling, columns, one)
+                M = solution_noise(J, columns, sampling, one)
             else:
                 for term in cross_noise(sampling, columns, one, two):
                     M[term.a, term.b] = J[term.base_a, term.base_b] * term.value
@@ -234,15 +265,16 @@ def range_row(x0, y0, f, geometry):
 
 
 def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampling, own_sampling, step):
-    """Covariance [n_flow, n_flow of the own flow], over image noise variances and ρ, of the motion parameters of the
-    grid's columns and of those of the camera at ``step``: the grid's normal equations hold its image with the weights of
-    window and smoothing."""
+    """Covariance [n_flow, n_flow of the own flow], per σ² ρ, of the motion parameters of grid and camera.
+
+    The grid's normal equations hold the image of the camera at ``step`` with the weights of window and smoothing.
+    """
     n, m = columns.n_flow, own_columns.n_flow
-    noise = J_own[:m, :m] * noise_ratio(own_sampling, own_columns, "t")
+    noise = solution_noise(J_own, own_columns, own_sampling, "t")
     X = np.zeros((n, m))
     for a, column in enumerate(columns.columns[:n]):
         factor = 1.0
-        exponents = dict(zip(AXES, column.exponents, strict=True))
+        exponents = dict(zip(AXES, column.terms[0].exponents, strict=True))
         for axis, k in zip(("sx", "sy"), step, strict=True):
             weights, smooth = np.array(sampling.axis(axis).weights), sampling.axis(axis).kernel(False)
             half, radius = len(weights) // 2, len(smooth) // 2
@@ -252,19 +284,25 @@ def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampl
                 if abs(k - i) <= radius
             )
         kept = tuple(0 if axis in ("sx", "sy") else e for axis, e in exponents.items())
-        partner = [b for b, c in enumerate(own_columns.columns[:m]) if (c.channel, c.exponents) == (column.channel, kept)]
+        partner = [
+            b for b, c in enumerate(own_columns.columns[:m])
+            if (c.channel, c.terms[0].exponents) == (column.channel, kept)
+        ]  # fmt: skip
         if partner:
             X[a] = factor * noise[partner[0]]
     return P_inverse @ X @ own_inverse
 
 
 def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()):
-    """The motion (N, Ω, A) and the covariance of its unknowns; ``geometry`` is what fit_geometry returned.
+    """The motion and the covariance of its unknowns, and the motion (N, Ω, A) from the reference's rows alone.
 
-    ``own``: (J, ρ) of every camera's own flow, in the order of ``problem.own_flows.steps``. First a fit to the rows of
-    the reference model; with own flows, one more to all rows, linearised there. The rows' covariance holds the noise of
-    the motion parameters, of the geometry that the design is built from, what both have in common and what cameras have
-    in common with the reference model. The weights leave out what is common to sets of rows, and to geometry and motion.
+    ``geometry`` is what fit_geometry returned.
+
+    ``own``: (J, ρ) of every camera's own flow, in the order of ``problem.own_flows.steps``. First comes a fit to the
+    rows of the reference model; with own flows, one more to all rows, linearised there. The rows' covariance holds the
+    noise of the motion parameters, of the geometry that the design is built from, what both have in common and what
+    cameras have in common with the reference model. The weights leave out what is common to sets of rows, and to
+    geometry and motion.
     """
     columns, sampling, f = problem.columns, problem.sampling, view.f_px
     shift, baseline = view.shift_px, view.baseline_mm
@@ -359,7 +397,7 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         first, rows = reference_rows(q)
         q[: problem.fitted], spread = fit([first], problem.fitted, [])
     if problem.own_flows is None:
-        return q[: problem.fitted], spread
+        return q[: problem.fitted], spread, q
     first, rows = reference_rows(q)
     sets, common = ([first], []) if problem.own_flows.reference_rows else ([], [])
     for step, (J_own, rho_own) in zip(problem.own_flows.steps, own, strict=True):
@@ -369,7 +407,7 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         elif sets:
             common.append(np.zeros((len(sets[0][1]), len(found[1]))))
         sets.append(found)
-    return fit(sets, problem.own_flows.unknowns, common)
+    return *fit(sets, problem.own_flows.unknowns, common), q
 
 
 def solve(J, columns: ColumnSet, sampling: Sampling, estimator):
@@ -390,12 +428,14 @@ def measure(J, rho, problem, view, x, y, own=()):
     columns, sampling = problem.columns, problem.sampling
     P, variance = solve(J, columns, sampling, problem.estimator)
     cov = covariances(J, variance, columns, sampling, rho, estimate.DENOISE[problem.estimator])
+    P, cov = at_centre(P, cov, columns)
     x0, y0, f = x - view.principal_px[0], y - view.principal_px[1], view.f_px
     found = {}
     for k, axis in enumerate(columns.solutions):
-        i = columns.index("i")
-        if i is not None:
-            found[f"brightness_{axis}"] = (-P[i, k], np.sqrt(cov[k, k, i, i]))
+        for o in ("1", "x", "y", "t") if axis == "t" else ("1",):
+            i = columns.index("i", o)
+            if i is not None:
+                found[f"brightness_{axis}{o.strip('1')}"] = (-P[i, k], np.sqrt(cov[k, k, i, i]))
         if axis == "t":
             for a in ("x", "y"):
                 i = columns.index(a)
@@ -421,8 +461,21 @@ def measure(J, rho, problem, view, x, y, own=()):
         put("slope_x", lambda g: surface(x0, y0, f, *g)[1])
         put("slope_y", lambda g: surface(x0, y0, f, *g)[2])
     if problem.unknowns:
-        q, cov_q = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
+        q, cov_q, alone = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
         for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=True):
             found[name] = (value, error)
+    if problem.world_brightness:
+        i = [columns.index("i", o) for o in problem.world_brightness]
+        Z0, ZX, ZY, c = surface(x0, y0, f, *g)
+        dX = Z0 / (f * c) * np.array([[1 - ZY * y0 / f, ZX * y0 / f], [ZY * x0 / f, 1 - ZX * x0 / f]])
+        A = np.zeros((len(i), len(i)))
+        A[:2, :2] = np.linalg.inv(dX)
+        if len(i) == 3:
+            Zt = alone[2] - ZX * alone[0] - ZY * alone[1]
+            drift = Zt / (f * c) * np.array([x0, y0]) - alone[:2]
+            A[2] = [*(-drift @ A[:2, :2]), 1.0]
+        values, spread = A @ -P[i, -1], A @ cov[-1, -1][np.ix_(i, i)] @ A.T
+        for name, value, variance in zip(("x", "y", "tt"), values, np.diag(spread), strict=False):
+            found[f"brightness_world_{name}"] = (value, np.sqrt(variance))
     return found

@@ -18,5 +18,6 @@ def ols(stage: Any, tables: Any) -> Callable[[Callable[..., None]], None]:
         launch(kernels.accept)
         launch(kernels.parameters)
         launch(kernels.residuals)
+        launch(kernels.centre)
 
     return solve

@@ -42,5 +42,6 @@ def _null_space(stage: Any, value: Any) -> Solve:
             launch(kernels.load)
             launch(kernels.factorise)
         launch(kernels.residuals)
+        launch(kernels.centre)
 
     return solve
