@@ -237,8 +237,11 @@ def test_the_page_can_be_drawn_once_more(tmp_path: Path) -> None:
     assert select(store.load(tmp_path / "dissertation", NAMES)["table-5.1"], {"variant": "a"}) == _record()
 
 
-def test_quick_panels_keep_both_ends_of_the_abscissa() -> None:
+def test_quick_panels_keep_both_ends_of_the_abscissa_and_few_variants() -> None:
     points = tuple(Point(float(x), scenes.sinusoid()) for x in range(6))
-    panel = Panel("p", points, (), (0, 0), (0, 0, 1, 1), 4, seeds=3).quick()
+    variants = tuple(Variant(str(k), {}) for k in range(14))
+    panel = Panel("p", points, variants, (0, 0), (0, 0, 1, 1), 4, seeds=3).quick()
     assert [point.x for point in panel.points] == [0.0, 5.0]
+    assert [variant.label for variant in panel.variants] == ["0", "4", "8", "12"]
     assert (panel.seeds, panel.stride) == (1, 8)
+    assert replace(panel, variants=variants[:4]).quick().variants == variants[:4]

@@ -127,6 +127,8 @@ def diagram_cell(diagram: Diagram, result: Result) -> Cell | None:
     if diagram.printed is None or diagram.best is None:
         return None
     points = curve(diagram, diagram.best, result)
+    if result.quick and not points:
+        return None
     value = max((y for _, y in points), default=math.nan)
     low, high = diagram.printed
     quantity = QUANTITIES[diagram.quantity]

@@ -76,42 +76,17 @@ class Panel:
     keep_maps: bool = False
 
     def quick(self) -> Panel:
-        """A small version: the ends of the abscissa, one sequence, few pixels."""
-        kept = sorted({0, len(self.points) - 1})
-        return replace(self, points=tuple(_quick_point(self.points[i]) for i in kept), seeds=1, stride=2 * self.stride)
-
-
-def _quick_point(point: Point) -> Point:
-    if isinstance(point.scene, CubeScene):
-        return replace(point, scene=replace(point.scene, supersampling=2))
-    return point
-
-
-@dataclass(frozen=True)
-class Diagram:
-    """A quantity over the abscissa; ``curves``: label -> (panel, variant).
-
-    ``printed``: range of the printed curves for noise-free images, drawn as a band; ``best``: the curve that is held
-    against its upper end, by its worst point. ``reason``: why it lies above.
-    """
-
-    title: str
-    quantity: str
-    x_label: str
-    curves: Mapping[str, Pair]
-    x_log: bool = True
-    statistic: Statistic = "mean"
-    region: str = "all"
-    printed: tuple[float, float] | None = None
-    best: str | None = None
-    reason: str = ""
-
-
-def diagrams(panel: Panel, x_label: str, quantities: Iterable[str], **options: Any) -> tuple[Diagram, ...]:
-    """One diagram per quantity with all variants of a panel."""
-    curves = {variant.label: (panel.name, variant.label) for variant in panel.variants}
-    named = {"title": panel.name, **options}
-    return tuple(Diagram(quantity=quantity, x_label=x_label, curves=curves, **named) for quantity in quantities)
+        """A small version: the ends of the abscissa, about four variants, one sequence, few pixels."""
+        points = tuple(self.points[i] for i in sorted({0, len(self.points) - 1}))
+        small = replace(
+            self, points=points, variants=self.variants[:: -(-len(self.variants) // 4)], seeds=1, stride=2 * self.stride
+        )
+        if not isinstance(points[0].scene, CubeScene):
+            return small
+        x0, y0, x1, y1 = self.roi
+        third = (y1 - y0) // 3
+        cubes = tuple(replace(point, scene=replace(point.scene, supersampling=2)) for point in points)
+        return replace(small, points=cubes, roi=(x0, y0 + third, x1, y1 - third))
 
 
 class Printed(NamedTuple):
