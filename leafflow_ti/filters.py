@@ -8,6 +8,7 @@ rad/px. The ones here, within 1.2e-4 of the printed, minimise the largest gain e
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,11 @@ def choose_filter_set(n_samples: int, wanted: str = "5") -> FilterSet | None:
         if int(name) <= n_samples and int(name) <= int(wanted.split("x")[0]):
             return filter_set("3x1x1" if wanted == "3x1x1" else name)
     return None
+
+
+def gaussian_radius(sigma: float) -> int:
+    """Half length of a Gaussian that is cut off at four sigmas."""
+    return math.ceil(4 * sigma)
 
 
 def gaussian_weights(size: int, sigma: float) -> Array:

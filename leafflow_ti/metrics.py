@@ -29,13 +29,14 @@ TRUTH_MAPS: dict[str, int | None] = {
     "omega": 3,
     "acceleration": 3,
     "flow": 2,
+    "growth_rate": None,
 }
 """Key of ``truth.npz`` -> components per pixel; None: a plain map."""
 
 LABELS = ("face", "region")
 """Keys of ``truth.npz`` with integer labels per pixel."""
 
-SCALARS = {"depth": "depth", "slope_x": "zx", "slope_y": "zy"}
+SCALARS = {"depth": "depth", "slope_x": "zx", "slope_y": "zy", "growth_rate": "growth_rate"}
 VECTORS = {"velocity": "velocity", "rotation": "omega", "acceleration": "acceleration", "flow": "flow"}
 """Map, or stem of the maps ``_x, _y[, _z]``, of the results -> key of the truth."""
 
@@ -268,6 +269,8 @@ def _errors(estimate: Maps, truth: Maps) -> Iterator[tuple[str, Array]]:
     if "slope_x" in found and "slope_y" in found:
         (zx, zx_true), (zy, zy_true) = found["slope_x"], found["slope_y"]
         yield "normal_deg", normal_error(zx, zy, zx_true, zy_true)
+    if "growth_rate" in found:
+        yield "growth_rate_percent", found["growth_rate"][0] - found["growth_rate"][1]
 
 
 def _has_truth(truth: Maps, shape: tuple[int, int]) -> Mask:

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import read_gray
-from leafflow_ti.errors import ConfigError
+from leafflow_ti.errors import ConfigError, InputError
+from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import EstimateStage, View
+from leafflow_ti.stages.prefilter import Prefilter
 from leafflow_ti.stages.tensor import Band, TensorStage
 from leafflow_ti.status import HAS_VALUE, Status
 
@@ -46,12 +48,13 @@ class Timings:
 
 @dataclass
 class _Engine:
-    """The stages for bands of one height: tensor of the reference model, tensors of the own flows, estimate.
+    """The stages for bands of one height: prefilter, tensor of the reference model, tensors of the own flows, estimate.
 
     ``inner``: the cameras of a block under the filters and window of the reference model; ``own_cameras``: place of
     each own flow's camera in a block.
     """
 
+    prefilter: Prefilter | None
     tensor: TensorStage
     own: list[TensorStage]
     estimate: EstimateStage
@@ -73,7 +76,7 @@ class _Engine:
 class Pipeline:
     """Computes the units of a plan on a device.
 
-    ``timings`` holds the seconds of the stages ``compile``, ``read``, ``tensor`` and ``estimate``.
+    ``timings`` holds the seconds of the stages ``compile``, ``read``, ``prefilter``, ``tensor`` and ``estimate``.
     Raises ConfigError for a mask that does not fit the images.
     """
 
@@ -82,8 +85,12 @@ class Pipeline:
         self.timings = Timings()
         self._engines: dict[int, _Engine] = {}
         self._mask = _read_mask(plan.config.output.mask, capture)
-        self._rows = self._measurable("y", plan.y, capture.height, 1)
-        self._cols = self._measurable("x", plan.x, capture.width, 0)
+        # Output pixels of the plan and those around them; rows and columns below count along these.
+        self._y, self._x = (_widened(r, n, plan.margin) for r, n in ((plan.y, capture.height), (plan.x, capture.width)))
+        self._rows = self._measurable("y", self._y, capture.height, 1)
+        self._cols = self._measurable("x", self._x, capture.width, 0)
+        inputs = INPUTS if plan.margin else ()
+        self._names = tuple(dict.fromkeys((*(n for n in plan.names if not n.startswith("growth")), *inputs)))
 
     def warm_up(self) -> float:
         """Compile every kernel of the plan on a tiny band; the seconds that it took."""
@@ -114,6 +121,10 @@ class Pipeline:
         plan, problem = self.plan, self.plan.problem
         tensor = TensorStage(self.device, problem.columns, plan.layout, problem.sampling, band)
         view = self._view((0, 0), band, tensor.out_pitch)
+        filters = plan.config.filters
+        prefilter = None
+        if filters.prefilter != "none":
+            prefilter = Prefilter(self.device, filters.prefilter, filters.sigma_pre, band.in_rows, band.in_cols)
         own = problem.own_flows
         stages: list[TensorStage] = []
         places: list[tuple[slice, slice]] = []
@@ -126,7 +137,8 @@ class Pipeline:
         sy, sx = (slice(-f - axis.radius, -f + axis.radius + 1) for f, axis in zip(
             first, (problem.sampling.sy, problem.sampling.sx), strict=True
         ))  # fmt: skip
-        return _Engine(tensor, stages, EstimateStage(self.device, problem, plan.layout, view), (sy, sx), places)
+        estimate = EstimateStage(self.device, problem, plan.layout, view, bool(plan.margin))
+        return _Engine(prefilter, tensor, stages, estimate, (sy, sx), places)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
         """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.
@@ -141,13 +153,13 @@ class Pipeline:
         return slice(inside[0], inside[-1] + 1) if inside else slice(0, 0)
 
     def _view(self, corner: tuple[int, int], band: Band, pitch: int) -> View:
-        """The output grid whose first pixel is (row, column) ``corner`` of the plan."""
+        """The output grid whose first pixel is (row, column) ``corner``."""
         plan, geometry = self.plan, self.plan.geometry
         offset = geometry.disparity_offset_px
         shift = (plan.preshift[0] + offset[0], plan.preshift[1] + offset[1])
         return View(
             geometry.f_px, geometry.principal_px, geometry.baseline_mm, shift,
-            plan.x[corner[1]], plan.y[corner[0]], plan.x.step, band.rows, band.cols, pitch,
+            self._x[corner[1]], self._y[corner[0]], plan.x.step, band.rows, band.cols, pitch,
         )  # fmt: skip
 
     def _sequence(self, index: int, first: int, last: int) -> Iterator[tuple[Unit, Maps, NDArray[np.uint8]]]:
@@ -156,28 +168,28 @@ class Pipeline:
         Only the rectangle of measurable pixels is computed; what lies around it is border.
         """
         plan = self.plan
-        whole = plan.band(index)
+        whole = self._around(plan.band(index))
         rows = slice(max(whole.start, self._rows.start), min(whole.stop, self._rows.stop))
         cols = self._cols
         if rows.start >= rows.stop or cols.start >= cols.stop:
             for t_index in range(first, last + 1):
-                yield plan.unit(t_index, index), *self._frame_of(whole, {}, None, None)
+                yield plan.unit(t_index, index), *self._frame_of(index, {}, None, None)
             return
         band = Band.of(plan.problem.sampling, rows.stop - rows.start, cols.stop - cols.start, plan.x.step)
         if band.rows not in self._engines:
+            self._engines.clear()  # bands come in order: one engine's memory at a time
             self._engines[band.rows] = self._make_engine(band)
         engine = self._engines[band.rows]
         engine.reset()
         engine.estimate.set_view(self._view((rows.start, cols.start), band, engine.tensor.out_pitch))
-        corner = (plan.y[rows.start] - band.halo_y, plan.x[cols.start] - band.halo_x)
+        corner = (self._y[rows.start] - band.halo_y, self._x[cols.start] - band.halo_x)
         inside, kept = self._inside(band, corner)
         centre = _centres(band)
         place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
         latency = engine.tensor.latency
         finite: dict[int, NDArray[np.bool_]] = {}
         for t in range(plan.frames[first] - latency, plan.frames[last] + latency + 1):
-            with self.timings.of("read"):
-                block, finite[t] = self._read(t, band, corner)
+            block, finite[t] = self._read(t, band, corner, engine.prefilter)
             with self.timings.of("tensor"):
                 tensors = engine.push(block, inside & kept & finite[t])
                 self.device.synchronize()
@@ -188,51 +200,96 @@ class Pipeline:
             with self.timings.of("estimate"):
                 maps, status = self._maps(engine.estimate(*tensors), finite[frame][centre])
                 unit = plan.unit(first + frame - plan.frames[first], index)
-                result = self._frame_of(whole, maps, status, place)
+                result = self._frame_of(index, maps, status, place)
             yield unit, *result
 
+    def _around(self, rows: slice) -> slice:
+        """Rows of the plan, and those that are computed around them."""
+        first, margin = int(self._y[0] != self.plan.y[0]), self.plan.margin
+        return slice(max(0, rows.start + first - margin), min(len(self._y), rows.stop + first + margin))
+
     def _frame_of(
-        self, rows: slice, maps: Maps, status: NDArray[np.uint8] | None, place: tuple[slice, slice] | None
+        self, band: int, maps: Maps, status: NDArray[np.uint8] | None, place: tuple[slice, slice] | None
     ) -> tuple[Maps, NDArray[np.uint8]]:
-        """The measured rectangle at ``place`` within the unit's rows; border around it, masked where the mask says."""
+        """The unit's maps with the measured rectangle at ``place`` within the rows around it; border around that,
+        masked where the mask says."""
         plan = self.plan
-        shape = (rows.stop - rows.start, len(plan.x))
+        whole = self._around(plan.band(band))
+        y, x = self._y[whole], self._x
+        shape = (len(y), len(x))
         codes = np.full(shape, Status.BORDER, np.uint8)
-        framed = {name: np.full(shape, np.nan, np.float32) for name in plan.names}
+        framed = {name: np.full(shape, np.nan, np.float32) for name in self._names}
         if place is not None and status is not None:
             codes[place] = status
         if self._mask is not None:
-            codes[~self._mask[np.ix_(plan.y[rows], plan.x)]] = Status.MASKED
+            codes[~self._mask[np.ix_(y, x)]] = Status.MASKED
         if place is not None:
             empty = ~np.isin(codes[place], HAS_VALUE)
             for name, values in maps.items():
                 values[empty] = np.nan
                 framed[name][place] = values
-        return framed, codes
+        if plan.margin:
+            geometry, sampling = plan.geometry, plan.problem.sampling
+            growth = growth_maps(framed, y, x, geometry.f_px, geometry.principal_px, sampling)
+            framed.update({name: values.astype(np.float32) for name, values in growth.items()})
+        unit = plan.y[plan.band(band)]
+        inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
+        return {n: framed[n][inner].copy() for n in plan.names}, codes[inner].copy()
 
-    def _read(self, t: int, band: Band, corner: tuple[int, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Preshifted block [sy, sx, in_rows, in_cols] with non-finite values replaced by 0, and where it was finite."""
-        y0, x0 = corner
-        block = self.capture.block(
-            [t], *self.plan.cameras, y0, y0 + band.in_rows, x0, x0 + band.in_cols, self.plan.preshift,
-            self.device.real("storage"),
-        )[0]  # fmt: skip
-        finite = np.isfinite(block)
-        if finite.all():
-            return block, np.ones(block.shape[2:], bool)
-        return np.where(finite, block, 0), finite.all(axis=(0, 1))
+    def _read(
+        self, t: int, band: Band, corner: tuple[int, int], prefilter: Prefilter | None
+    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Preshifted, prefiltered block [sy, sx, in_rows, in_cols], 0 where not finite, and where all were finite."""
+        radius = prefilter.radius if prefilter else 0
+        (y0, x0), (rows, cols) = (n - radius for n in corner), (n + 2 * radius for n in (band.in_rows, band.in_cols))
+        with self.timings.of("read"):
+            block = self.capture.block(
+                [t], *self.plan.cameras, y0, y0 + rows, x0, x0 + cols, self.plan.preshift, self.device.real("storage")
+            )[0]
+            finite = np.isfinite(block)
+        if prefilter:
+            with self.timings.of("prefilter"):
+                in_y, in_x = self._seen(y0 + np.arange(rows), x0 + np.arange(cols))
+                valid = finite & in_y[:, None, :, None] & in_x[None, :, None, :]
+                if self.plan.config.filters.prefilter == "homomorphic":
+                    self._require_positive(block, valid, t, (y0, x0))
+                stack = (-1, rows, cols)
+                inner = slice(radius, rows - radius), slice(radius, cols - radius)
+                finite = finite[:, :, *inner]
+                block = prefilter(block.reshape(stack), valid.reshape(stack)).reshape(finite.shape)
+        elif not finite.all():
+            block = np.where(finite, block, 0)
+        return block, finite.all(axis=(0, 1))
+
+    def _require_positive(self, block: NDArray[Any], valid: NDArray[np.bool_], t: int, corner: tuple[int, int]) -> None:
+        """Raise InputError for the first grey value that has no logarithm."""
+        wrong = valid & (block <= 0)
+        if not wrong.any():
+            return
+        j, k, row, col = (int(n) for n in np.argwhere(wrong)[0])
+        sy, sx = self.plan.cameras[0][j], self.plan.cameras[1][k]
+        x = corner[1] + col + self.plan.preshift[0] * (sx - self.capture.reference[1])
+        y = corner[0] + row + self.plan.preshift[1] * (sy - self.capture.reference[0])
+        raise InputError(
+            f"{self.capture.image_name(t, sy, sx)}: grey value {block[j, k, row, col]:g} at pixel x = {x}, y = {y}: "
+            "prefilter homomorphic takes logarithms and needs values above 0: choose prefilter highpass, or add an "
+            "offset to the images"
+        )
+
+    def _seen(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which rows ``y`` [cameras along y, n] and columns ``x`` [cameras along x, n] of blocks lie inside images."""
+        capture, shift = self.capture, self.plan.preshift
+        rows, cols = (
+            np.array(cameras)[:, None] - n for cameras, n in zip(self.plan.cameras, capture.reference, strict=True)
+        )
+        in_y, in_x = y + shift[1] * rows, x + shift[0] * cols
+        return (in_y >= 0) & (in_y < capture.height), (in_x >= 0) & (in_x < capture.width)
 
     def _inside(self, band: Band, corner: tuple[int, int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Where every camera sees its image, and where the mask allows a measurement: [in_rows, in_cols]."""
-        plan, capture = self.plan, self.capture
+        capture = self.capture
         y, x = corner[0] + np.arange(band.in_rows), corner[1] + np.arange(band.in_cols)
-        in_y, in_x = np.ones(y.size, bool), np.ones(x.size, bool)
-        for k in plan.cameras[0]:
-            shifted = y + plan.preshift[1] * (k - capture.reference[0])
-            in_y &= (shifted >= 0) & (shifted < capture.height)
-        for k in plan.cameras[1]:
-            shifted = x + plan.preshift[0] * (k - capture.reference[1])
-            in_x &= (shifted >= 0) & (shifted < capture.width)
+        in_y, in_x = (np.logical_and.reduce(seen) for seen in self._seen(y, x))
         inside = in_y[:, None] & in_x
         if self._mask is None:
             return inside, np.ones_like(inside)
@@ -246,7 +303,7 @@ class Pipeline:
         status = planes[Output.STATUS].astype(np.uint8)
         status[~finite] = Status.NOT_FINITE
         maps = {}
-        for name in self.plan.names:
+        for name in self._names:
             base = name.removesuffix("_std")
             plane = _plane_of(base) + (Output.STD if name != base else 0)
             maps[name] = planes[plane].astype(np.float32)
@@ -263,7 +320,16 @@ def _plane_of(name: str) -> int:
 
     if name in MOTION_NAMES:
         return Output.MOTION + MOTION_NAMES.index(name)
+    if name in DIFFERENCES:
+        return Output.DIFFERENCES + DIFFERENCES.index(name)
     return int(Output[name.upper()])
+
+
+def _widened(positions: range, size: int, margin: int) -> range:
+    """The positions, and up to ``margin`` more on each side where these lie within 0..size - 1."""
+    step, last = positions.step, positions[-1]
+    before, behind = min(margin, positions.start // step), min(margin, (size - 1 - last) // step)
+    return range(positions.start - step * before, last + step * behind + 1, step)
 
 
 def _centres(band: Band) -> tuple[slice, slice]:

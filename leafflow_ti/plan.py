@@ -17,6 +17,7 @@ from leafflow_ti.filters import choose_filter_set, filter_set
 from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set, parse_rows
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
+from leafflow_ti.stages.prefilter import prefilter_bytes
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -92,7 +93,14 @@ class Plan:
             names += [f"brightness_{a}" for a in problem.camera_axes]
         names += [BRIGHTNESS_MAPS[o] for o in problem.brightness]
         names += [WORLD_MAPS[o] for o in problem.world_brightness]
+        if "depth" in names and problem.unknowns >= 3:
+            names.append("growth_rate")
         return tuple(names)
+
+    @property
+    def margin(self) -> int:
+        """Output pixels around a band, and around the region, that are computed for the sake of those inside."""
+        return int(any(name.startswith("growth") for name in self.names))
 
     def band(self, index: int) -> slice:
         """Output rows of one band."""
@@ -136,6 +144,9 @@ class Plan:
             lines.append(f"motion      {problem.unknowns} unknowns from {' and '.join(taken)}")
         pixels = len(self.frames) * len(self.y) * len(self.x)
         limit = self.config.plan.max_memory
+        filters = self.config.filters
+        if filters.prefilter != "none":
+            lines.append(f"prefilter   {filters.prefilter}, sigma {filters.sigma_pre:g} px")
         lines += [
             f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
             f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
@@ -158,6 +169,11 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     name = resolve_model(config.model.name, capture.n_frames, capture.n_rows, capture.n_cols)
     model = MODELS[name]
     _check_model(name, capture)
+    if config.filters.prefilter == "highpass" and config.model.brightness != "none":
+        raise ConfigError(
+            f"brightness '{config.model.brightness}' is relative to the grey value, which prefilter 'highpass' takes "
+            "away: choose prefilter homomorphic, or brightness none"
+        )
     row, col = capture.reference
     use_x = capture.n_cols > 1 and model.cameras != "reference"
     use_y = capture.n_rows > 1 and (model.cameras == "grid" or (model.cameras == "line" and not use_x))
@@ -205,10 +221,12 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
             f"output.roi = {x0},{y0},{x1},{y1} reaches beyond the images of {size} pixels: make it smaller"
         )
     x, y = range(x0, x1, w.stride), range(y0, y1, w.stride)
-    band_rows, memory = _band_rows(config, problem, layout, len(y), len(x))
+    cameras = _cameras(sampling, own, row, col)
+    n_cameras = len(cameras[0]) * len(cameras[1])
+    band_rows, memory = _band_rows(config, problem, layout, n_cameras, len(y), len(x))
     return Plan(
         config, name, problem, layout, _geometry(capture),
-        _cameras(sampling, own, row, col),
+        cameras,
         _preshift(capture, config) if grid else (0, 0),
         _frames(capture, config, sampling.t.radius, model.time), y, x, band_rows, memory,
     )  # fmt: skip
@@ -318,18 +336,23 @@ def _preshift(capture: Capture, config: RunConfig) -> tuple[int, int]:
     return (found[0] if capture.n_cols > 1 else 0, found[1] if capture.n_rows > 1 else 0)
 
 
-def _band_rows(config: RunConfig, problem: Problem, layout: TensorLayout, rows: int, cols: int) -> tuple[int, int]:
+def _band_rows(
+    config: RunConfig, problem: Problem, layout: TensorLayout, n_cameras: int, rows: int, cols: int
+) -> tuple[int, int]:
     """Rows of a unit, and the memory that it takes."""
     itemsize = 4 if config.precision == "f32" else 8
 
     def size(n: int) -> int:
-        band = Band.of(problem.sampling, n, cols, config.window.stride)
+        # Two more rows and columns for the growth at the edges.
+        band = Band.of(problem.sampling, n + 2, cols + 2, config.window.stride)
         total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
         own = problem.own_flows
         if own:
             total += len(own.steps) * band_bytes(
                 own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize
             )
+        if config.filters.prefilter != "none":
+            total += prefilter_bytes(config.filters.sigma_pre, n_cameras, band.in_rows, band.in_cols, itemsize)
         return total
 
     limit = int(0.8 * config.plan.max_memory)

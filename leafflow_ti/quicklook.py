@@ -40,6 +40,9 @@ STATUS_COLOURS: dict[Status, str] = {
 }
 """Colour of each status in the pictures."""
 
+SIGNED = ("growth_rate",)
+"""Maps whose colours diverge about zero even where all values have one sign."""
+
 _DPI = 120
 _IMAGE_INCHES = 3.1
 _LEFT_INCHES, _RIGHT_INCHES, _ABOVE_INCHES, _BELOW_INCHES = 0.65, 1.35, 0.35, 0.5
@@ -53,9 +56,9 @@ _Panel = Callable[["Axes"], None]
 def write_quicklooks(store: ResultStore, t_index: int, folder: str | Path) -> list[Path]:
     """Write the pictures of the frame with index ``t_index`` along t into ``folder``; return their paths.
 
-    ``overview.png`` and ``status.png`` always; ``depth.png``, ``normals.png``, ``motion.png``, ``rotation.png`` and
-    ``flow.png`` where the store has their maps. Raises MissingExtra where matplotlib is not installed, RunError when
-    the folder cannot be written.
+    ``overview.png`` and ``status.png`` always; ``depth.png``, ``normals.png``, ``motion.png``, ``rotation.png``,
+    ``flow.png`` and ``growth.png`` where the store has their maps. Raises MissingExtra where matplotlib is not
+    installed, RunError when the folder cannot be written.
     """
     try:
         from matplotlib.figure import Figure
@@ -115,6 +118,9 @@ def _pages(field: Field) -> dict[str, list[_Panel]]:
         pages[page] = panels
         if base != "rotation" and f"{base}_x" in field and f"{base}_y" in field:
             pages[page] = [*panels, partial(_draw_arrows, field, base)]
+    if "growth_rate" in field:
+        pages["growth"] = _maps(field, ["growth_rate", "growth_rate_std"])
+        overview += pages["growth"][:1]
     return {**pages, "status": [partial(_draw_status, field)], "overview": overview}
 
 
@@ -156,6 +162,9 @@ def _image(axes: Axes, field: Field, values: NDArray[np.floating], **options: An
 
 def _draw_map(field: Field, name: str, axes: Axes) -> None:
     low, high = robust_limits(field[name])
+    if name in SIGNED:
+        high = max(-low, high)
+        low = -high
     colours = "coolwarm" if low < 0 < high else "cividis" if name.endswith("_std") else "viridis"
     image = _image(axes, field, field[name], cmap=colours, vmin=low, vmax=high)
     unit, long_name = quantity(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from itertools import product
 
@@ -87,6 +88,17 @@ class Sampling:
         return float(np.prod([self.axis(a).moment(e) for a, e in zip(AXES, exponents, strict=True)]))
 
 
+def difference_variance(axis: AxisSampling, span: int, power: int = 0) -> float:
+    """Variance of ``(e(span) - e(0)) / span`` per variance of e, the error of a moment ``Σ w(Δ) Δ^power n(Δ)``.
+
+    Windows side by side share most of their noise n, the errors at distance d have the correlation
+    ``R(d) = Σ v(Δ) v(Δ + d) / Σ v²``, v = w Δ^power, and the quotient the variance ``2 (1 - R(span)) / span²``.
+    """
+    v = np.convolve(axis.window(power), axis.kernel(False))
+    shared = float(np.dot(v[span:], v[: max(v.size - span, 0)]) / np.dot(v, v))
+    return 2 * (1 - shared) / span**2
+
+
 def noise_gain(sampling: Sampling, channel: str) -> float:
     """Variance of a channel per variance of the image noise: product of the squared filter norms (2.24)."""
     return float(np.prod([np.sum(sampling.axis(a).kernel(a == channel) ** 2) for a in AXES]))
@@ -152,6 +164,7 @@ class NoiseTerm:
     value: float
 
 
+@functools.lru_cache(maxsize=64)
 def noise_ratio(sampling: Sampling, columns: ColumnSet, solution: str) -> tuple[Array, tuple[NoiseTerm, ...]]:
     """``Cov(Σ w f n) = σ² ρ (J_ff ∘ K + terms)`` for the solution along ``solution``: K [n_flow, n_flow] and terms.
 
@@ -190,6 +203,7 @@ def noise_ratio(sampling: Sampling, columns: ColumnSet, solution: str) -> tuple[
                     found[pair] = found.get(pair, 0.0) + sign * u * v * r * s * float(K[p, q])
             found.pop((a, b))
             terms += [NoiseTerm(a, b, *pair, value) for pair, value in found.items()]
+    K.flags.writeable = False  # shared by all who ask
     return K, tuple(terms)
 
 

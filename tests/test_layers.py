@@ -22,6 +22,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime",), 4),
     **dict.fromkeys(("stages",), 5),
+    **dict.fromkeys(("growth",), 5),
     **dict.fromkeys(("plan", "pipeline"), 6),
     **dict.fromkeys(("results", "quicklook", "api"), 7),
     **dict.fromkeys(("cli",), 8),

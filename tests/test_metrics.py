@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from leafflow_ti.cli.evaluate import format_reports
 from leafflow_ti.cli.main import main
 from leafflow_ti.errors import InputError
 from leafflow_ti.metrics import (
@@ -132,6 +133,17 @@ def test_evaluate_by_hand() -> None:
     assert report.coverage["depth"].within_1 == 0.0
     assert report.coverage["depth"].within_2 == 1.0
     assert reports["left"].errors["depth_mm"].mean == pytest.approx(1.0)
+
+
+def test_growth_is_compared_in_percent() -> None:
+    estimate = {"growth_rate": np.array([[0.5, 0.1]]), "growth_rate_std": np.array([[0.2, 0.1]])}
+    report = evaluate(estimate, {"growth_rate": np.zeros((1, 2))}, {"all": np.ones((1, 2), np.bool_)})["all"]
+    assert (report.errors["growth_rate_percent"].mean, report.errors["growth_rate_percent"].std) == pytest.approx(
+        (0.3, 0.2)
+    )
+    assert report.coverage["growth_rate"].mean == pytest.approx(1.75)
+    row = next(line for line in format_reports({"all": report}) if "growth_rate [%/frame]" in line)
+    assert row.split()[2:4] == ["2", "0.3"]
 
 
 def test_evaluate_needs_something_in_common() -> None:

@@ -39,6 +39,7 @@ def make(folder: Path, names: tuple[str, ...], empty: bool = False) -> ResultSto
     ("names", "pages"),
     [
         (STEREO + MOTION, {"depth", "normals", "motion", "rotation", "status", "overview"}),
+        (("depth", "growth_rate", "growth_rate_std"), {"depth", "growth", "status", "overview"}),
         (STEREO, {"depth", "normals", "status", "overview"}),
         (("disparity",), {"depth", "status", "overview"}),
         (FLOW, {"flow", "status", "overview"}),

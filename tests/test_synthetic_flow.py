@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from reference.flow_model import predict, preshift
 
-from leafflow_ti.synthetic.exact_flow import flow_parameters, preshifted_flow_parameters
-from leafflow_ti.synthetic.plane import PlaneScene, sinusoid_scene
+from leafflow_ti.synthetic.exact_flow import flow_parameters, optical_flow, preshifted_flow_parameters
+from leafflow_ti.synthetic.plane import PlaneScene, sinusoid_scene, truth
 
 MOVING = PlaneScene(
     f_px=900.0,
@@ -49,6 +49,13 @@ def assert_equal_parameters(found: Mapping[str, Any], wanted: Mapping[str, Any],
 @pytest.mark.parametrize(("x", "y"), PIXELS)
 def test_closed_form_agrees_with_differences(scene: PlaneScene, x: float, y: float) -> None:
     assert_equal_parameters(flow_parameters(scene, x, y), closed_form(scene, x, y), rel=1e-8)
+
+
+@pytest.mark.parametrize("scene", [MOVING, FAR_PIVOT])
+def test_flow_of_growing_material_is_its_projected_velocity(scene: PlaneScene) -> None:
+    scene = replace(scene, growth=0.02, size=(3, 3), principal_px=(1.0, 1.0))
+    at = np.array([-1.0, 1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(optical_flow(scene, at), truth(scene)["flow"][2, 0], rtol=1e-8)
 
 
 @pytest.mark.parametrize("scene", CASES)

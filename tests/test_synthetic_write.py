@@ -126,7 +126,7 @@ def test_simulate_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         "--principal-px 5,4 --baseline-mm .7,.8 --centre-mm 1,2 --depth-mm 90 --slope-x -.3 --slope-y .2 "
         "--velocity -.1,.2,.3 --omega-deg .1,-.2,.3 --rotation-centre-mm 1,2,3 --acceleration .01,0,-.02 "
         "--offset 120 --amplitude 30 --wavelength-mm 2 --alpha-deg 30 --beta-deg 45 --brightness t,1,.01 "
-        "--brightness sx,2,.02,.03,.04"
+        "--brightness sx,2,.02,.03,.04 --growth .5"
     )
     assert command("simulate", "plane", out, *options.split()) == 0
     assert "2 frames of 1 x 3 cameras" in capsys.readouterr().out
@@ -153,8 +153,10 @@ def test_simulate_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         alpha=np.pi / 6,
         beta=np.pi / 4,
         brightness=(plane.BrightnessTerm("t", 1, 0.01), plane.BrightnessTerm("sx", 2, 0.02, 0.03, 0.04)),
+        growth=plane.linear_growth(0.5),
     )
     np.testing.assert_array_equal(read_images(out, 2, 3), plane.render(scene)[:, 0])
+    np.testing.assert_allclose(np.load(out / "truth.npz")["growth_rate"], 0.5, rtol=1e-12)
     np.testing.assert_allclose(np.load(out / "truth.npz")["velocity"], plane.truth(scene)["velocity"], rtol=1e-12)
 
 
@@ -190,7 +192,9 @@ def test_simulate_cube(tmp_path: Path) -> None:
     )
     stored = np.array([tifffile.imread(out / f"cam_{sx:02d}.tif") for sx in range(2)])
     np.testing.assert_allclose(stored, cube.render(scene)[0, 0], rtol=1e-6)
-    assert set(np.unique(np.load(out / "truth.npz")["face"])) == {0, 1, 2}
+    stored_truth = np.load(out / "truth.npz")
+    assert set(np.unique(stored_truth["face"])) == {0, 1, 2}
+    np.testing.assert_array_equal(stored_truth["growth_rate"], np.where(stored_truth["face"] > 0, 0.0, np.nan))
 
 
 @pytest.mark.parametrize(
@@ -205,6 +209,8 @@ def test_simulate_cube(tmp_path: Path) -> None:
         (["plane", "--brightness", "q,1,2"], "AXIS t, sx or sy"),
         (["plane", "--brightness", "t,1"], "--brightness t,1,"),
         (["plane", "--slope-x", "nan"], "zx = nan"),
+        (["plane", "--growth", "-100"], "growth = -100 %/frame: an area cannot lose all of itself"),
+        (["plane", "--growth", "70"], "would vanish within the 9 frames"),
         (["cube", "--light", "moon"], "light 'moon'"),
         (["cube", "--frames", "0"], "n_frames = 0"),
     ],

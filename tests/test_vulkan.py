@@ -16,8 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from reference import chain
+from test_prefilter import assert_equals_twin
 from tolerances import SOLVERS, tolerance
 
+from leafflow_ti.stages.prefilter import PREFILTERS
 from leafflow_ti.status import Status
 
 pytestmark = pytest.mark.vulkan
@@ -46,7 +48,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + 3} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(PREFILTERS) + 3} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -92,6 +94,11 @@ def on_vulkan_the_chain_equals_the_twin(
             map_value, map_std = (m[pixel] for m in found.map(name))
             assert abs(map_value - value) <= limit.maps * std, name
             assert map_std == pytest.approx(std, rel=limit.errors), name
+
+
+@pytest.mark.parametrize("kind", PREFILTERS)
+def on_vulkan_the_prefilter_equals_the_twin(device: Callable, kind: str) -> None:
+    assert_equals_twin(device("f32"), kind, 1e-6)
 
 
 def on_vulkan_the_solvers_agree(bench: Callable) -> None:

@@ -79,6 +79,10 @@ class Capture(ABC):
     def _window(self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int) -> Array:
         """Non-empty window inside the image, in any type; the caller does not write to it."""
 
+    def image_name(self, t: int, sy: int, sx: int) -> str:
+        """What to call one image in a message."""
+        return f"frame {t}, camera row {sy}, column {sx}"
+
     @abstractmethod
     def fingerprint(self) -> dict[str, Any]:
         """What identifies the input in a result's provenance."""
@@ -144,6 +148,11 @@ class FileCapture(Capture):
         if self.layout.info.windowed:
             return self._checked(path, read_window(path, page, self.channel, y0, y1, x0, x1))
         return self._cache.get((path, page), lambda: self._decode(path, page))[y0:y1, x0:x1]
+
+    def image_name(self, t: int, sy: int, sx: int) -> str:
+        """The file, and the page where it holds several."""
+        path, page = self.layout.paths[self.layout.file[t, sy, sx]], int(self.layout.page[t, sy, sx])
+        return f"{path}, page {page}" if page else str(path)
 
     def _decode(self, path: Path, page: int) -> Array:
         image = self._checked(path, read_window(path, page, self.channel, 0, self.height, 0, self.width))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from leafflow_ti.metrics import RegionReport
     from leafflow_ti.results import ResultStore
 
-UNITS = {"deg": "°", "mm": "mm", "px": "px"}
+UNITS = {"deg": "°", "mm": "mm", "px": "px", "percent": "%/frame"}
 
 
 def evaluate(

@@ -20,15 +20,18 @@ Model = Annotated[
     str | None,
     _text(
         "model",
-        "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d",
-        "What is estimated [auto: affine-4d for a line of cameras, affine-5d for a 2D grid, depth without time, "
-        "flow-affine for one camera].",
+        "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d|scene-flow|"
+        "affine-scene-flow",
+        "What is estimated [auto: affine-scene-flow for a camera grid, depth without time, flow-affine for one camera].",
     ),
 ]
 Motion = Annotated[
-    str | None, _text("motion", "translation|rotation|acceleration", "Unknowns of the 3D motion [rotation].")
+    str | None,
+    _text("motion", "auto|translation|rotation|acceleration", "Unknowns of the 3D motion [auto: rotation, if it can]."),
 ]
-Rows = Annotated[str | None, _text("rows", "auto|2d[+b5][+as][+at]", "Flow parameters that enter the 3D fit [auto].")]
+Rows = Annotated[
+    str | None, _text("rows", "auto|(u|2d)[+b5][+as][+at]", "Flow parameters that enter the 3D fit [auto].")
+]
 Brightness = Annotated[
     str | None, _text("brightness", "none|temporal|spatial|camera", "Brightness changes that are modelled [none].")
 ]
@@ -48,6 +51,10 @@ Border = Annotated[
     _text("border", "full|clip", "Where the whole window is inside, or up to the border [full]."),
 ]
 Taps = Annotated[str | None, _text("taps", "3x1x1|3|5|7", "Derivative filters [5].")]
+Prefilter = Annotated[
+    str | None, _text("prefilter", "none|highpass|homomorphic", "Filter of every image against uneven light [none].")
+]
+SigmaPre = Annotated[float | None, _text("sigma-pre", "PIXELS", "Gaussian width of the prefilter [8].")]
 Frames = Annotated[str | None, _text("frames", "A:B", "Frame indices to measure, B excluded [all].")]
 Roi = Annotated[str | None, _text("roi", "x0,y0,x1,y1", "Pixels to measure, x1 and y1 excluded [all].")]
 Mask = Annotated[str | None, _text("mask", "FILE", "Image whose zero pixels are left out.")]

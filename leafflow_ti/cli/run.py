@@ -48,6 +48,8 @@ def run(
     stride: options.Stride = None,
     border: options.Border = None,
     taps: options.Taps = None,
+    prefilter: options.Prefilter = None,
+    sigma_pre: options.SigmaPre = None,
     frames: options.Frames = None,
     roi: options.Roi = None,
     mask: options.Mask = None,

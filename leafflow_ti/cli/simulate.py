@@ -90,6 +90,12 @@ def _brightness(option: str, texts: list[str]) -> tuple[Any, ...]:
     return tuple(terms)
 
 
+def _growth(option: str, percent: float) -> float:
+    from leafflow_ti.synthetic.plane import linear_growth
+
+    return linear_growth(percent)
+
+
 FIELDS: dict[str, tuple[str, Callable[[str, Any], Any]]] = {
     "cameras": ("n_cols", _keep),
     "rows": ("n_rows", _keep),
@@ -114,6 +120,7 @@ FIELDS: dict[str, tuple[str, Callable[[str, Any], Any]]] = {
     "alpha_deg": ("alpha", _degrees),
     "beta_deg": ("beta", _degrees),
     "brightness": ("brightness", _brightness),
+    "growth": ("growth", _growth),
     # cube
     "edges_mm": ("edges_mm", _numbers(3)),
     "orientation_deg": ("orientation", _degrees_xyz),
@@ -203,6 +210,9 @@ def plane(
             "Term (G + GX X + GY Y) AXIS^POWER of the logarithm of the brightness: AXIS is t (frames), sx or sy (mm); "
             "X, Y are mm from the centre. May be repeated.",
         ),
+    ] = None,
+    growth: Annotated[
+        float | None, _option("growth", "PERCENT", "Growth of its area about the centre, %/frame [0].")
     ] = None,
 ) -> None:
     """A moving plane with a cosine texture; by default the sinusoid of Schuchert 2010, section 5.3."""

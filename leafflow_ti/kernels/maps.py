@@ -32,8 +32,9 @@ class Output(IntEnum):
     BRIGHTNESS_WORLD_Y = 22
     BRIGHTNESS_WORLD_TT = 23
     STD = 24
-    STATUS = 48
-    PLANES = 49
+    DIFFERENCES = 48  # 2 x packed [3]: covariance of the velocity's difference quotients along x and y
+    STATUS = 60
+    PLANES = 61
 
 
 @functools.cache
@@ -216,5 +217,12 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
                 q = base + (number[Region.MOTION] + j) * stride + i
                 cov = base + (number[Region.MOTION_COV] + j * n + j) * stride + i
                 put(out, Output.MOTION + j, pixel + i, n_pixels, ws[q], ws[cov])
+            if n >= 3:
+                for axis in range(2):
+                    for r in range(3):
+                        for c in range(r + 1):
+                            cov = base + (number[Region.DIFFERENCE_COV] + (axis * n + r) * n + c) * stride + i
+                            plane = Output.DIFFERENCES + 6 * axis + tri(r, c)
+                            out[plane * n_pixels + pixel + i] = ti.cast(ws[cov], real)
 
     return SimpleNamespace(measured=batch_kernel(spec, measured), motion=batch_kernel(spec, motion))

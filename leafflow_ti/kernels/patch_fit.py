@@ -17,8 +17,9 @@ from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value, batch_kernel
 
-START, CLEAR, FINISH = 1, 2, 4
-"""What a launch does besides adding its rows: forget the motion, forget the sums (both before), solve (after)."""
+START, CLEAR, FINISH, DIFFERENCES = 1, 2, 4, 8
+"""What a launch does besides adding its rows: forget the motion, forget the sums (both before), solve (after), find the
+covariances of difference quotients (in every launch of a fit, or in none)."""
 RANGE_CODE = 6
 
 
@@ -129,7 +130,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
 def patch_fit_kernel(spec: KernelSpec):
     """The stage that adds a set of rows to the sums, and solves for the motion and its covariance with the last one.
 
-    Its ``which`` is a sum of ``START``, ``CLEAR`` and ``FINISH``.
+    Its ``which`` is a sum of ``START``, ``CLEAR``, ``DIFFERENCES`` and ``FINISH``.
     """
     precise, lanes = spec.precise, spec.lanes
     small, patch = dense(spec), patch_functions(spec)
@@ -313,18 +314,44 @@ def patch_fit_kernel(spec: KernelSpec):
         small.store(ws, at, total)
 
     @ti.func
-    def accumulate(base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()):
-        """Add the rows to the normal equations and to what their covariance is made of."""
+    def difference(
+        base: ti.i32, stride: ti.i32, n_rows: ti.i32, axis: ti.i32,
+        number: ti.template(), value: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """Scale the rows of WEIGHTED by what of their errors a difference quotient along an axis is left with.
+
+        Windows side by side share most of their noise; how much, depends on the offset of the row.
+        """
+        n, offsets = number[Number.UNKNOWNS], number[Number.OFFSETS]
+        for r in range(n_rows):
+            code = RANGE_CODE
+            if r < 2 * offsets:
+                code = number[Number.OFFSET_CODES + r % offsets]
+            factor = value[Value.DIFFERENCE + code]
+            if axis == 1:  # the rows are scaled for x
+                factor = value[Value.DIFFERENCE + RANGE_CODE + 1 + code] / factor
+            at = base + (number[Region.WEIGHTED] + r * n) * stride
+            for e in range(n):
+                for i in range(lanes):
+                    ws[at + e * stride + i] *= factor
+
+    @ti.func
+    def accumulate(
+        base: ti.i32, stride: ti.i32, n_rows: ti.i32, variant: ti.i32, number: ti.template(), ws: ti.template()
+    ):
+        """Add the rows to the normal equations (variant 0) and to what the covariance of a variant is made of."""
         n, terms = number[Number.UNKNOWNS], number[Number.TERMS]
+        spread = number[Region.NORMAL_SPREAD] + variant * n * n
+        left = number[Region.LEFT] + variant * (terms + number[Number.CORRELATED]) * n
         weighted = base + number[Region.WEIGHTED] * stride
         work = base + number[Region.MOTION_WORK] * stride
         small.symmetric_times(ws, base + number[Region.OWN] * stride, weighted, work, n_rows, n, stride)
-        for part in range(4):
-            x, step, rows, target = number[Region.DESIGN], MAX_UNKNOWNS, n, number[Region.NORMAL]
+        for part in range(ti.select(variant == 0, 4, 2)):
+            x, step, rows, target = number[Region.MOTION_WORK], n, n, spread
             if part == 1:
-                x, step, rows, target = number[Region.MOTION_WORK], n, n, number[Region.NORMAL_SPREAD]
+                x, step, rows, target = number[Region.DERIVATIVE], terms, terms, left
             elif part == 2:
-                x, step, rows, target = number[Region.DERIVATIVE], terms, terms, number[Region.LEFT]
+                x, step, rows, target = number[Region.DESIGN], MAX_UNKNOWNS, n, number[Region.NORMAL]
             elif part == 3:
                 x, step, rows, target = number[Region.VALUE], 1, 1, number[Region.NORMAL_RHS]
             for r in range(rows):
@@ -335,13 +362,14 @@ def patch_fit_kernel(spec: KernelSpec):
 
     @ti.func
     def correlate(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32,
+        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, variant: ti.i32,
         number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
     ):  # fmt: skip
         """What the reference's rows share with the geometry, and an own flow's with the reference's rows."""
         n, terms, rows_t = number[Number.UNKNOWNS], number[Number.TERMS], number[Number.ROWS_T]
         used = 2 * number[Number.OFFSETS]
         weighted = base + number[Region.WEIGHTED] * stride
+        first = variant * (terms + number[Number.CORRELATED])
         kept = base + number[Region.REFERENCE_VARIANCE] * stride
         variance = base + (number[Region.VARIANCE] + number[Number.MOTION_SOLUTION]) * stride
         if number[Number.OWN_FLOW] == 0:
@@ -350,10 +378,10 @@ def patch_fit_kernel(spec: KernelSpec):
                 for a in range(terms + number[Number.CORRELATED]):
                     # Geometry times motion rows, then the response of the motion rows to the normal equations.
                     x = base + (number[Region.GEOMETRY_CROSS] + a * rows_t) * stride
-                    at = base + (number[Region.RIGHT] + a * n + c) * stride
+                    at = base + (number[Region.RIGHT] + (first + a) * n + c) * stride
                     if a >= terms:
                         x = base + (number[Region.RESPONSE_T] + (a - terms) * rows_t) * stride
-                        at = base + (number[Region.LEFT] + a * n + c) * stride
+                        at = base + (number[Region.LEFT] + (first + a) * n + c) * stride
                     add(ws, at, small.dot(ws, x, 1, weighted + c * stride, n, used, stride))
         else:
             factor = ti.Vector.zero(precise, lanes)
@@ -372,45 +400,48 @@ def patch_fit_kernel(spec: KernelSpec):
                         term = small.dot(ws, x, 1, weighted + c * stride, n, used, stride)
                         for i in range(lanes):
                             term[i] *= factor[i] * value[Value.PARTNER + a]
-                        add(ws, base + (number[Region.RIGHT] + (terms + a) * n + c) * stride, term)
+                        add(ws, base + (number[Region.RIGHT] + (first + terms + a) * n + c) * stride, term)
 
     @ti.func
-    def finish(base: ti.i32, stride: ti.i32, number: ti.template(), ws: ti.template()):
-        """Motion and covariance from the sums."""
+    def finish(base: ti.i32, stride: ti.i32, variants: ti.i32, number: ti.template(), ws: ti.template()):
+        """Motion from the sums, its covariance and, with three variants, those of its difference quotients."""
         n, terms = number[Number.UNKNOWNS], number[Number.TERMS]
         normal = base + number[Region.MOTION_WORK] * stride
         q = base + number[Region.MOTION] * stride
-        cov = base + number[Region.MOTION_COV] * stride
-        left = base + number[Region.LEFT] * stride
-        right = base + number[Region.RIGHT] * stride
         small.copy(ws, base + number[Region.NORMAL_RHS] * stride, q, n, stride)
         for r in range(n):
             small.copy(ws, base + (number[Region.NORMAL] + r * n) * stride, normal + tri(r, 0) * stride, r + 1, stride)
         small.cholesky(ws, normal, n, -1, stride)
         small.solve(ws, normal, q, n, 1, stride)
-        for a in range(terms):
-            # LEFT^T cov LEFT as two transposed halves.
-            x = base + (number[Region.GEOMETRY_COV] + a * terms) * stride
-            for c in range(n):
-                half = small.dot(ws, x, 1, left + c * stride, n, terms, stride)
-                for i in range(lanes):
-                    half[i] *= precise(0.5)
-                add(ws, right + (a * n + c) * stride, half)
         count = terms + number[Number.CORRELATED]
-        for r in range(n):
-            for c in range(n):
-                element = ti.Vector.zero(precise, lanes)
-                own = base + (number[Region.NORMAL_SPREAD] + r * n + c) * stride
-                for i in range(lanes):
-                    element[i] = ws[own + i]
-                for side in range(2):
-                    one = ti.select(side == 0, r, c)
-                    two = ti.select(side == 0, c, r)
-                    part = small.dot(ws, left + one * stride, n, right + two * stride, n, count, stride)
+        for variant in range(variants):
+            cov = base + number[Region.MOTION_COV] * stride
+            if variant > 0:
+                cov = base + (number[Region.DIFFERENCE_COV] + (variant - 1) * n * n) * stride
+            left = base + (number[Region.LEFT] + variant * count * n) * stride
+            right = base + (number[Region.RIGHT] + variant * count * n) * stride
+            for a in range(terms):
+                # LEFT^T cov LEFT as two transposed halves.
+                x = base + (number[Region.GEOMETRY_COV] + a * terms) * stride
+                for c in range(n):
+                    half = small.dot(ws, x, 1, left + c * stride, n, terms, stride)
                     for i in range(lanes):
-                        element[i] += part[i]
-                small.store(ws, cov + (r * n + c) * stride, element)
-        small.sandwich(ws, normal, cov, n, 2, stride)
+                        half[i] *= precise(0.5)
+                    add(ws, right + (a * n + c) * stride, half)
+            for r in range(n):
+                for c in range(n):
+                    element = ti.Vector.zero(precise, lanes)
+                    own = base + (number[Region.NORMAL_SPREAD] + (variant * n + r) * n + c) * stride
+                    for i in range(lanes):
+                        element[i] = ws[own + i]
+                    for side in range(2):
+                        one = ti.select(side == 0, r, c)
+                        two = ti.select(side == 0, c, r)
+                        part = small.dot(ws, left + one * stride, n, right + two * stride, n, count, stride)
+                        for i in range(lanes):
+                            element[i] += part[i]
+                    small.store(ws, cov + (r * n + c) * stride, element)
+            small.sandwich(ws, normal, cov, n, 2, stride)
 
     @ti.func
     def patch_fit(
@@ -429,9 +460,13 @@ def patch_fit_kernel(spec: KernelSpec):
         if number[Number.OWN_FLOW] == 1:
             leave_out(base, pixel, stride, n_pixels, n_rows, number, value, J, ws)
         weigh(base, stride, n_rows, number, ws)
-        accumulate(base, stride, n_rows, number, ws)
-        correlate(base, pixel, stride, n_pixels, number, value, J, ws)
+        variants = ti.select(which & DIFFERENCES != 0, 3, 1)
+        for variant in range(variants):
+            if variant > 0:
+                difference(base, stride, n_rows, variant - 1, number, value, ws)
+            accumulate(base, stride, n_rows, variant, number, ws)
+            correlate(base, pixel, stride, n_pixels, variant, number, value, J, ws)
         if which & FINISH != 0:
-            finish(base, stride, number, ws)
+            finish(base, stride, variants, number, ws)
 
     return batch_kernel(spec, patch_fit)

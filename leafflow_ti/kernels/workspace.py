@@ -56,6 +56,7 @@ class Region(IntEnum):
     GEOMETRY_WORK = auto()  # [S, G]
     MOTION = auto()  # [9]
     MOTION_COV = auto()  # [9, 9]
+    DIFFERENCE_COV = auto()  # [2, 9, 9]: of difference quotients of the motion along x and y
     DESIGN = auto()  # [M, 9]
     VALUE = auto()  # [M]
     WEIGHTED = auto()  # [M, 9]: weights times design
@@ -65,9 +66,9 @@ class Region(IntEnum):
     MOTION_WORK = auto()  # [M, 9], packed [9]
     NORMAL = auto()  # [9, 9]; from here on: sums over the sets of rows of the motion fit
     NORMAL_RHS = auto()  # [9]
-    NORMAL_SPREAD = auto()  # [9, 9]
-    LEFT = auto()  # [G + F, 9]: by the errors of the geometry, of the reference's normal equations
-    RIGHT = auto()  # [G + F, 9]: what is correlated with them
+    NORMAL_SPREAD = auto()  # [3, 9, 9]: for the motion and its difference quotients along x and y, as the next two
+    LEFT = auto()  # [3, G + F, 9]: by the errors of the geometry, of the reference's normal equations
+    RIGHT = auto()  # [3, G + F, 9]: what is correlated with them
     REFERENCE_VARIANCE = auto()  # [1]
 
 
@@ -126,6 +127,7 @@ class Layout:
             Region.GEOMETRY_WORK: s * terms,
             Region.MOTION: MAX_UNKNOWNS,
             Region.MOTION_COV: MAX_UNKNOWNS * MAX_UNKNOWNS,
+            Region.DIFFERENCE_COV: 2 * MAX_UNKNOWNS * MAX_UNKNOWNS,
             Region.DESIGN: motion * MAX_UNKNOWNS,
             Region.VALUE: motion,
             Region.WEIGHTED: motion * MAX_UNKNOWNS,
@@ -135,9 +137,9 @@ class Layout:
             Region.MOTION_WORK: max(motion * MAX_UNKNOWNS, packed(MAX_UNKNOWNS)),
             Region.NORMAL: MAX_UNKNOWNS * MAX_UNKNOWNS,
             Region.NORMAL_RHS: MAX_UNKNOWNS,
-            Region.NORMAL_SPREAD: MAX_UNKNOWNS * MAX_UNKNOWNS,
-            Region.LEFT: (terms + flow) * MAX_UNKNOWNS,
-            Region.RIGHT: (terms + flow) * MAX_UNKNOWNS,
+            Region.NORMAL_SPREAD: 3 * MAX_UNKNOWNS * MAX_UNKNOWNS,
+            Region.LEFT: 3 * (terms + flow) * MAX_UNKNOWNS,
+            Region.RIGHT: 3 * (terms + flow) * MAX_UNKNOWNS,
             Region.REFERENCE_VARIANCE: 1,
         }
 
@@ -224,7 +226,8 @@ class Value(IntEnum):
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9
     CENTRE = CROSS + 18  # MAX_SQUARES: factors
     PARTNER = CENTRE + MAX_SQUARES  # MAX_COLUMNS: factor of the noise shared with each column of the reference model
-    RATIO = PARTNER + MAX_COLUMNS  # k x packed [F], then k x NOISE_TERMS
+    DIFFERENCE = PARTNER + MAX_COLUMNS  # 2 x 7: by axis and offset code of a row; roots of sampling.difference_variance
+    RATIO = DIFFERENCE + 14  # k x packed [F], then k x NOISE_TERMS
 
 
 @functools.cache

@@ -18,6 +18,7 @@ from leafflow_ti.sampling import (
     Sampling,
     column_noise,
     cross_noise,
+    difference_variance,
     noise_gain,
     noise_ratio,
     shared_noise,
@@ -181,13 +182,14 @@ class _Tables:
 class EstimateStage:
     """Maps of ``Output`` planes [rows, pitch] from the packed tensors of ``TensorStage``.
 
-    One tensor of the reference model, and one of each camera's own flow where the problem has them.
+    One tensor of the reference model, and one of each camera's own flow where the problem has them. ``differences``:
+    the covariances of the velocity's difference quotients are wanted, too; growth needs them.
     """
 
-    def __init__(self, device: Device, problem: Problem, layout: TensorLayout, view: View):
+    def __init__(self, device: Device, problem: Problem, layout: TensorLayout, view: View, differences: bool = True):
         from leafflow_ti.kernels.workspace import Layout
 
-        self.device, self.problem, self.view = device, problem, view
+        self.device, self.problem, self.view, self.differences = device, problem, view, differences
         columns, own = problem.columns, problem.own_flows
         rows = self._rows()
         n_rows = [2 * len(problem.offsets) + problem.use_range] + ([2 * len(own.offsets)] if own else [])
@@ -201,8 +203,7 @@ class EstimateStage:
             # The same rows among all unknowns.
             self._final = _Tables(self.reference.number.copy(), self.reference.value)
             self._set_numbers(self._final.number, UNKNOWNS=own.unknowns, CORRELATED=columns.n_flow)
-            own_layout = TensorLayout.of(own.columns)
-            self._own = [self._own_tables(own, own_layout, step) for step in own.steps]
+            self._own = self._own_tables(own)
             self._all_tables += [self._final, *self._own]
         self.set_view(view)
         lanes = device.dense.lanes
@@ -313,36 +314,47 @@ class EstimateStage:
                 value[Value.CROSS + k * 9 + j] = term.value
         return tables
 
-    def _own_tables(self, own: OwnFlows, layout: TensorLayout, step: tuple[int, int]) -> _Tables:
-        """Tables of one camera's own flow; ``step``: where it stands."""
+    def _own_tables(self, own: OwnFlows) -> list[_Tables]:
+        """Tables of each camera's own flow: they differ by where the camera stands."""
         from leafflow_ti.kernels.workspace import Number, Value
 
-        found = [own.columns.index(c, o) for c in ("x", "y") for o in own.offsets]
-        tables = self._tables(own.columns, own.sampling, layout, own.offsets, [i for i in found if i is not None])
-        number, value = tables.number, tables.value
         columns = self.problem.columns
-        self._set_numbers(number, OWN_FLOW=1, UNKNOWNS=own.unknowns, CORRELATED=columns.n_flow * own.reference_rows)
+        rows = [own.columns.index(c, o) for c in ("x", "y") for o in own.offsets]
+        common = self._tables(
+            own.columns, own.sampling, TensorLayout.of(own.columns), own.offsets, [i for i in rows if i is not None]
+        )
+        correlated = columns.n_flow if own.reference_rows else 0
+        self._set_numbers(common.number, OWN_FLOW=1, UNKNOWNS=own.unknowns, CORRELATED=correlated)
         moves = [own.columns.index(c, o) for c in ("x", "y") for o in ("x", "y")]
-        number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
-        value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
-        for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
-            number[Number.PARTNER + a] = partner
-            if partner >= 0:
-                scales = self.reference.value[Value.SCALE + a], value[Value.SCALE + partner]
-                value[Value.PARTNER + a] = factor * scales[0] / scales[1]
-        return tables
+        common.number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
+        found = []
+        for step in own.steps:
+            number, value = common.number.copy(), common.value.copy()
+            value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
+            for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
+                number[Number.PARTNER + a] = partner
+                if partner >= 0:
+                    scales = self.reference.value[Value.SCALE + a], value[Value.SCALE + partner]
+                    value[Value.PARTNER + a] = factor * scales[0] / scales[1]
+            found.append(_Tables(number, value))
+        return found
 
     def set_view(self, view: View) -> None:
         """Move to another band of the same size."""
         from leafflow_ti.kernels.workspace import Value
 
         self.view = view
+        factors = np.sqrt([
+            difference_variance(self.problem.sampling.axis(axis), 2 * view.step, int(offset == axis))
+            for axis in ("x", "y") for offset in ("1", *AXES, "range")
+        ])  # fmt: skip
         for tables in self._all_tables:
             self._set_numbers(tables.number, OUT_X=view.x, OUT_Y=view.y, STEP=view.step, PITCH=view.pitch)
             value = tables.value
             value[Value.F], value[Value.PX], value[Value.PY] = view.f_px, *view.principal_px
             value[Value.BASELINE : Value.BASELINE + 2] = view.baseline_mm
             value[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
+            value[Value.DIFFERENCE : Value.DIFFERENCE + 14] = factors
             tables.on_device = (self.device.array(tables.number, "int"), self.device.array(value, "algebra"))
 
     @staticmethod
@@ -368,7 +380,7 @@ class EstimateStage:
         """The planes of ``Output`` as a NumPy array [planes, rows, cols]."""
         from leafflow_ti.kernels.covariance import covariance_kernels
         from leafflow_ti.kernels.maps import Output, maps_kernels
-        from leafflow_ti.kernels.patch_fit import CLEAR, FINISH, START, patch_fit_kernel
+        from leafflow_ti.kernels.patch_fit import CLEAR, DIFFERENCES, FINISH, START, patch_fit_kernel
 
         device, view, problem, own = self.device, self.view, self.problem, self.problem.own_flows
         lanes = device.dense.lanes
@@ -379,6 +391,7 @@ class EstimateStage:
             for tables, one in zip(self._own, own_tensors, strict=True):
                 tables.tensor = one
         covariance, maps = covariance_kernels(device.dense), maps_kernels(device.dense)
+        differences = DIFFERENCES if self.differences else 0
         for first in range(0, n_pixels // lanes, self._groups):
             groups = min(self._groups, n_pixels // lanes - first)
             step, stride = (self.layout.n_elements * lanes, lanes) if not device.gpu else (1, groups)
@@ -412,15 +425,17 @@ class EstimateStage:
             if problem.fitted:
                 fit = patch_fit_kernel(device.dense)
                 for i in range(problem.passes):
-                    launch(fit, which=(START if i == 0 else CLEAR) | FINISH)
+                    last = i == problem.passes - 1 and not own
+                    launch(fit, which=(START if i == 0 else CLEAR) | FINISH | (differences if last else 0))
             launch(maps.measured)
             if own:
                 if own.reference_rows:
-                    launch(fit, self._final, which=CLEAR)
+                    launch(fit, self._final, which=CLEAR | differences)
                 for i, tables in enumerate(self._own):
                     flow_of(tables, 0)
                     clear = CLEAR if i == 0 and not own.reference_rows else 0
-                    launch(fit, tables, which=clear | (FINISH if i == len(self._own) - 1 else 0))
+                    finish = FINISH if i == len(self._own) - 1 else 0
+                    launch(fit, tables, which=clear | differences | finish)
             if problem.unknowns:
                 launch(maps.motion, self._final if own else self.reference)
         planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)

@@ -23,7 +23,7 @@ from leafflow_ti.stages.planes import Filtering, Terms, round_up
 
 EXTRA_PLANES = 4
 """Behind the tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
-OUTPUT_PLANES = 49
+OUTPUT_PLANES = 61
 _CAMERA = ("sy", "sx")
 _PASSES = ("t", "sy", "sx", "y", "x")
 _MASS, _ENERGY, _SMOOTH, _LEVEL = ((name, (0, 0)) for name in ("mass", "energy", "smooth", "level"))

@@ -147,8 +147,8 @@ def truth(scene: CubeScene) -> dict[str, Array]:
     """What the middle camera sees at the middle frame, at the pixel centres; NaN beside the box.
 
     ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] mm/frame and ``acceleration`` [H, W, 3] mm/frame² of
-    the point seen; ``flow`` [H, W, 2] px/frame; ``omega`` [3] rad/frame; ``face`` [H, W] integer label, 0 beside the
-    box (see FACES).
+    the point seen; ``flow`` [H, W, 2] px/frame; ``omega`` [3] rad/frame; ``growth_rate`` [H, W], none: 0 %/frame;
+    ``face`` [H, W] integer label, 0 beside the box (see FACES).
     """
     camera = np.zeros(3)
     x, y = scene.ray_axes()
@@ -170,6 +170,7 @@ def truth(scene: CubeScene) -> dict[str, Array]:
         "omega": np.array(scene.omega),
         "acceleration": acceleration,
         "flow": scene.image_motion(points, velocity),
+        "growth_rate": np.where(face > 0, 0.0, np.nan),
         "face": face,
     }
 

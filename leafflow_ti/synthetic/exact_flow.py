@@ -1,6 +1,6 @@
 """Exact flow parameters of a moving plane, by finite differences of following material points.
 
-An oracle: it knows ray, plane and rigid motion only, none of the flow equations (Schuchert 2010, chapters 5 and 6).
+An oracle: it knows ray, plane and its material's motion only, none of the flow equations (Schuchert 2010, ch. 5 and 6).
 Two fields are defined at every pixel (x, y) [px, relative to the principal point] of every camera position s [mm] and
 time t [frames], from the material point seen there:
 
@@ -110,12 +110,10 @@ def disparity(scene: PlaneScene, place: Array, axis: int) -> Array:
 def optical_flow(scene: PlaneScene, place: Array) -> Array:
     """Image motion [2, px/frame] of the material point seen at ``place`` = (x, y, sx, sy, t)."""
     point, camera, t = _seen(scene, place)
-    rotation, shift = scene.pose(t)
-    start = rotation.T @ (point - shift)
+    offset = scene.material(point, t)
 
     def follow(d: float) -> Array:
-        rotation, shift = scene.pose(t + d)
-        return _image(scene, rotation @ start + shift, camera)
+        return _image(scene, scene.place(offset, t + d), camera)
 
     return _derivative(follow, _steps(scene)[4])
 

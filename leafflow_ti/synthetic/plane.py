@@ -1,4 +1,4 @@
-"""A textured, rigidly moving plane, rendered by exact ray/plane intersection (Schuchert 2010, App. B).
+"""A textured plane that moves rigidly and may grow, rendered by exact ray/plane intersection (Schuchert 2010, App. B).
 
 The texture, fixed to the material, is
 
@@ -6,7 +6,8 @@ The texture, fixed to the material, is
     xP =  cos α p + sin α q,   yP = -sin β p + cos β q                   p, q: in-plane coordinates from the centre
 
 with ``p, q`` along the axes of the smallest rotation that turns (0, 0, 1) into the normal; α = β turns an orthogonal
-pattern in its plane, α ≠ β shears it.
+pattern in its plane, α ≠ β shears it. With growth g the material expands in its plane about the centre: what was at
+``(p, q)`` at t = 0 is at ``(1 + g t) (p, q)``.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class PlaneScene(RigidScene):
     """The plane ``Z = Z0 + ZX (X - X0) + ZY (Y - Y0)`` and its texture; motion and cameras are inherited.
 
     ``alpha``, ``beta`` in rad (``beta`` None: equal to ``alpha``), ``offset`` and ``amplitude`` in grey values.
+    ``growth``: g [1/frame], of lengths; see ``linear_growth``.
     Raises UsageError for values that make no sense.
     """
 
@@ -65,9 +67,16 @@ class PlaneScene(RigidScene):
     alpha: float = 0.0
     beta: float | None = None
     brightness: tuple[BrightnessTerm, ...] = ()
+    growth: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        ends = (self.time(0), self.time(self.n_frames - 1), -0.5, 0.5)
+        if min(self.size_at(t) for t in ends) <= 0.0:
+            raise UsageError(
+                f"growth = {self.growth:g} per frame: the plane would vanish within the {self.n_frames} frames: "
+                "choose less"
+            )
         if min(self.wavelengths_mm) <= 0.0:
             raise UsageError(f"wavelengths {self.wavelengths_mm} mm: both must be positive")
 
@@ -87,10 +96,30 @@ class PlaneScene(RigidScene):
             )
         return np.asarray(camera + (distance / slant)[..., None] * rays)
 
+    def size_at(self, t: float) -> float:
+        """Lengths in the plane at ``t`` frames, relative to those at t = 0."""
+        return 1.0 + self.growth * t
+
+    @property
+    def growth_rate(self) -> float:
+        """Growth of the area between half a frame before and after t = 0, in %/frame."""
+        return 100.0 * ((self.size_at(0.5) / self.size_at(-0.5)) ** 2 - 1.0)
+
+    def place(self, offsets: Array, t: float) -> Array:
+        """Where the material points ``offsets`` [..., 3] (see ``material``) are at time ``t``, in the world."""
+        rotation, shift = self.pose(t)
+        return np.asarray((np.array(self.centre) + self.size_at(t) * offsets) @ rotation.T + shift)
+
     def material(self, points: Array, t: float) -> Array:
         """Where the material points now at ``points`` [..., 3] were at t = 0, relative to the patch centre [mm]."""
         rotation, shift = self.pose(t)
-        return np.asarray((points - shift) @ rotation - np.array(self.centre))
+        return np.asarray(((points - shift) @ rotation - np.array(self.centre)) / self.size_at(t))
+
+    def point_motion(self, points: Array) -> tuple[Array, Array]:
+        """Velocity and acceleration at t = 0 of the material at points [..., 3] of the plane, growth included."""
+        velocity, acceleration = super().point_motion(points)
+        spreading = self.growth * (points - np.array(self.centre))
+        return velocity + spreading, acceleration + 2.0 * np.cross(np.array(self.omega), spreading)
 
     def texture(self, offsets: Array) -> Array:
         """Grey values [...] of the material points ``offsets`` [..., 3], without brightness changes."""
@@ -135,9 +164,9 @@ def render(
 def truth(scene: PlaneScene) -> dict[str, Array]:
     """What the middle camera sees at the middle frame.
 
-    ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] = N + Ω × (X - Xr) mm/frame, of the point seen at the
-    pixel; ``omega`` [3] rad/frame; ``acceleration`` [H, W, 3] = A + Ω × (Ω × (X - Xr)) mm/frame²;
-    ``flow`` [H, W, 2] px/frame.
+    ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] = N + Ω × (X - Xr) + g (X - Xc) mm/frame, of the point
+    seen at the pixel; ``omega`` [3] rad/frame; ``acceleration`` [H, W, 3] = A + Ω × (Ω × (X - Xr)) + 2 g Ω × (X - Xc)
+    mm/frame²; ``flow`` [H, W, 2] px/frame; ``growth_rate`` [H, W] %/frame.
     """
     points = scene.intersect(scene.rays(), np.zeros(3), 0.0)
     velocity, acceleration = scene.point_motion(points)
@@ -149,7 +178,18 @@ def truth(scene: PlaneScene) -> dict[str, Array]:
         "omega": np.array(scene.omega),
         "acceleration": acceleration,
         "flow": scene.image_motion(points, velocity),
+        "growth_rate": np.full(points.shape[:2], scene.growth_rate),
     }
+
+
+def linear_growth(percent: float) -> float:
+    """The ``growth`` of a scene whose area grows by ``percent`` %/frame; UsageError unless above -100."""
+    if not percent > -100.0:
+        raise UsageError(
+            f"growth = {percent:g} %/frame: an area cannot lose all of itself in a frame: choose more than -100"
+        )
+    k = math.sqrt(1.0 + percent / 100.0)
+    return 2.0 * (k - 1.0) / (k + 1.0)
 
 
 def sinusoid_scene(noise: float = 0.0, size: tuple[int, int] = (161, 161), bits: int | None = None) -> PlaneScene:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import correlate1d, minimum_filter
 
 from leafflow_ti.models import AXES, ColumnSet
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio
+from leafflow_ti.sampling import Sampling, column_noise, cross_noise, difference_variance, noise_ratio
 from leafflow_ti.stages import estimate
 
 ARRAY_AXIS = {"t": 0, "sy": 1, "sx": 2, "y": 3, "x": 4}
@@ -294,7 +294,10 @@ def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampl
 
 
 def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()):
-    """The motion and the covariance of its unknowns, and the motion (N, Ω, A) from the reference's rows alone.
+    """The motion, three covariances, and the motion (N, Ω, A) from the reference's rows alone.
+
+    The covariances are those of the unknowns, and of their central differences along x and y; in a difference, a row is
+    left with less of its error: a row with an offset along that axis is a first moment of its window, all others means.
 
     ``geometry`` is what fit_geometry returned.
 
@@ -328,7 +331,7 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         if has_range:
             D[-1, it] += 1.0
         floor = np.array([estimate.MODEL_ERROR[code] for code in codes]) * (np.abs(A) @ np.abs(q))
-        return A, value, C, D, shared, np.diag(floor**2)
+        return A, value, C, D, shared, np.diag(floor**2), codes
 
     def reference_rows(q):
         rows = [columns.index(d, o) for d in ("x", "y") for o in problem.offsets]
@@ -375,13 +378,23 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         return found, shared @ E.T
 
     def fit(sets, n, common):
-        """Unknowns [n] and covariance; ``common``: covariance of the first set's rows with each other set's."""
+        """Unknowns [n] and covariances; ``common``: covariance of the first set's rows with each other set's."""
         weights = []
-        for _, _, C, D, _, left_out in sets:
+        for _, _, C, D, _, left_out, _ in sets:
             weights.append(np.linalg.inv(C + D @ cov_g @ D.T + left_out) if problem.weighted else np.eye(len(C)))
         normal = sum(A[:, :n].T @ W @ A[:, :n] for (A, *_), W in zip(sets, weights, strict=True))
         gains = [np.linalg.solve(normal, A[:, :n].T @ W) for (A, *_), W in zip(sets, weights, strict=True)]
         solution = sum(G @ s[1] for G, s in zip(gains, sets, strict=True))
+        spreads = [spread_of(gains, sets, common)]
+        for axis in ("x", "y"):
+            scaled = []
+            for G, s in zip(gains, sets, strict=True):
+                left = [difference_variance(sampling.axis(axis), 2 * view.step, int(code == axis)) for code in s[6]]
+                scaled.append(G * np.sqrt(left))
+            spreads.append(spread_of(scaled, sets, common))
+        return solution, spreads
+
+    def spread_of(gains, sets, common):
         by_geometry = sum(G @ s[3] for G, s in zip(gains, sets, strict=True))
         spread = sum(G @ s[2] @ G.T for G, s in zip(gains, sets, strict=True)) + by_geometry @ cov_g @ by_geometry.T
         for G, s in zip(gains, sets, strict=True):
@@ -390,14 +403,14 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         for G, C in zip(gains[1:], common, strict=True):
             part = gains[0] @ C @ G.T
             spread += part + part.T
-        return solution, spread
+        return spread
 
     q = np.zeros(9)
     for _ in range(problem.passes):
         first, rows = reference_rows(q)
-        q[: problem.fitted], spread = fit([first], problem.fitted, [])
+        q[: problem.fitted], spreads = fit([first], problem.fitted, [])
     if problem.own_flows is None:
-        return q[: problem.fitted], spread, q
+        return q[: problem.fitted], spreads, q
     first, rows = reference_rows(q)
     sets, common = ([first], []) if problem.own_flows.reference_rows else ([], [])
     for step, (J_own, rho_own) in zip(problem.own_flows.steps, own, strict=True):
@@ -461,7 +474,7 @@ def measure(J, rho, problem, view, x, y, own=()):
         put("slope_x", lambda g: surface(x0, y0, f, *g)[1])
         put("slope_y", lambda g: surface(x0, y0, f, *g)[2])
     if problem.unknowns:
-        q, cov_q, alone = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
+        q, (cov_q, *_), alone = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
         for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=True):
             found[name] = (value, error)
@@ -478,4 +491,20 @@ def measure(J, rho, problem, view, x, y, own=()):
         values, spread = A @ -P[i, -1], A @ cov[-1, -1][np.ix_(i, i)] @ A.T
         for name, value, variance in zip(("x", "y", "tt"), values, np.diag(spread), strict=False):
             found[f"brightness_world_{name}"] = (value, np.sqrt(variance))
+    return found
+
+
+def velocity_differences(J, rho, problem, view, x, y, own=()):
+    """Covariances of the velocity's central differences: name -> (value, geometric mean of its variances)."""
+    columns, sampling = problem.columns, problem.sampling
+    P, variance = solve(J, columns, sampling, problem.estimator)
+    cov = covariances(J, variance, columns, sampling, rho, estimate.DENOISE[problem.estimator])
+    geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
+    x0, y0 = x - view.principal_px[0], y - view.principal_px[1]
+    _, (_, *spreads), _ = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
+    found = {}
+    for axis, C in zip(("x", "y"), spreads, strict=True):
+        for a, b in ("xx", "xy", "yy", "xz", "yz", "zz"):
+            i, j = "xyz".index(a), "xyz".index(b)
+            found[f"difference_{axis}_{a}{b}"] = (C[i, j], np.sqrt(C[i, i] * C[j, j]))
     return found
