@@ -89,6 +89,33 @@ class Panel:
         return replace(small, points=cubes, roi=(x0, y0 + third, x1, y1 - third))
 
 
+@dataclass(frozen=True)
+class Diagram:
+    """A quantity over the abscissa; ``curves``: label -> (panel, variant).
+
+    ``printed``: range of the printed curves for noise-free images, drawn as a band; ``best``: the curve that is held
+    against its upper end, by its worst point. ``reason``: why it lies above.
+    """
+
+    title: str
+    quantity: str
+    x_label: str
+    curves: Mapping[str, Pair]
+    x_log: bool = True
+    statistic: Statistic = "mean"
+    region: str = "all"
+    printed: tuple[float, float] | None = None
+    best: str | None = None
+    reason: str = ""
+
+
+def diagrams(panel: Panel, x_label: str, quantities: Iterable[str], **options: Any) -> tuple[Diagram, ...]:
+    """One diagram per quantity with all variants of a panel."""
+    curves = {variant.label: (panel.name, variant.label) for variant in panel.variants}
+    named = {"title": panel.name, **options}
+    return tuple(Diagram(quantity=quantity, x_label=x_label, curves=curves, **named) for quantity in quantities)
+
+
 class Printed(NamedTuple):
     """A printed value, with its standard deviation over the region where that is printed."""
 
