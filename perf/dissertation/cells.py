@@ -166,13 +166,17 @@ def experiment_cells(experiment: Experiment, result: Result) -> list[Cell]:
 
 @dataclass(frozen=True)
 class Check:
-    """One value that the project is held to: a record's statistic, at most ``limit`` (a number, or another record)."""
+    """One value that the project is held to: a record's statistic, at most ``limit`` (a number, or another record).
+
+    ``reason``: why it is missed.
+    """
 
     text: str
     experiment: str
     selection: Selection
     limit: float | Selection
     statistic: str = "mean"
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -199,4 +203,5 @@ def _checked(check: Check, result: Result | None) -> Cell:
         return Cell(check.text, "", math.nan, "–", goal=limit, note=note or "not measured")
     value = {"mean": record.mean, "|mean|": abs(record.mean), "std": record.std}[check.statistic]
     text = _text(record.mean, record.std) if check.statistic == "mean" else number(value)
-    return Cell(check.text, "", value, text, QUANTITIES[record.quantity].unit, goal=limit)
+    cell = Cell(check.text, "", value, text, QUANTITIES[record.quantity].unit, goal=limit)
+    return cell if cell.met else replace(cell, reason=check.reason)

@@ -92,7 +92,8 @@ def _goals(results: Mapping[str, Result]) -> str:
 def _goal_row(cell: Cell) -> str:
     limit = number(math.nan if cell.goal is None else cell.goal)
     mark = '<td class="good"><b>met</b></td>' if cell.met else '<td class="bad"><b>not met</b></td>'
-    note = f"<small>{escape(cell.note)}</small>" if cell.note else ""
+    remark = cell.note or cell.reason
+    note = f"<small>{escape(remark)}</small>" if remark else ""
     name = ": ".join(filter(None, (cell.row, cell.column)))
     return f"<tr><td>{escape(name)}</td><td>{escape(f'{cell.text} {cell.unit}')}{note}</td><td>{limit}</td>{mark}</tr>"
 
