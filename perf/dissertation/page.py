@@ -25,7 +25,7 @@ caption { text-align: left; font-weight: 600; padding: .3em 0; }
 th, td { border: 1px solid #d5d5d5; padding: .3em .6em; text-align: left; vertical-align: top; }
 th { background: #f4f4f4; font-weight: 600; } td small { display: block; color: #555; }
 .good { background: #e1effa; } .bad { background: #fce8d8; }
-.good b { color: #004c7a; } .bad b { color: #8f3a00; }
+td b { white-space: nowrap; } .good b { color: #004c7a; } .bad b { color: #8f3a00; }
 img { max-width: 100%; height: auto; margin: .6em 0; display: block; }
 .quiet { color: #555; } nav a { margin-right: 1em; }
 """
@@ -92,8 +92,7 @@ def _goals(results: Mapping[str, Result]) -> str:
 def _goal_row(cell: Cell) -> str:
     limit = number(math.nan if cell.goal is None else cell.goal)
     mark = '<td class="good"><b>met</b></td>' if cell.met else '<td class="bad"><b>not met</b></td>'
-    remark = cell.note or cell.reason
-    note = f"<small>{escape(remark)}</small>" if remark else ""
+    note = f"<small>{escape(_remark(cell))}</small>" if _remark(cell) else ""
     name = ": ".join(filter(None, (cell.row, cell.column)))
     return f"<tr><td>{escape(name)}</td><td>{escape(f'{cell.text} {cell.unit}')}{note}</td><td>{limit}</td>{mark}</tr>"
 
@@ -145,9 +144,13 @@ def _limit(cell: Cell) -> str:
 
 
 def _explanations(worse: Iterable[Cell]) -> str:
-    told = [(f"{cell.row}, {cell.column}", cell.reason or cell.note or "not explained yet.") for cell in worse]
+    told = [(f"{cell.row}, {cell.column}", _remark(cell) or "not explained yet.") for cell in worse]
     lines = [f"<li>{escape(name)}: {escape(reason)}</li>" for name, reason in told]
     return f"<p>Worse than printed, or short of the goal:</p><ul>{''.join(lines)}</ul>" if lines else ""
+
+
+def _remark(cell: Cell) -> str:
+    return ": ".join(filter(None, (cell.note, cell.reason)))
 
 
 def _failures(result: Result) -> str:

@@ -51,6 +51,8 @@ def _svg(group: Sequence[Diagram], result: Result) -> str:
 
 
 def _draw(axes: Any, diagram: Diagram, result: Result, handles: dict[str, Any]) -> None:
+    from matplotlib.ticker import LogLocator
+
     quantity = QUANTITIES[diagram.quantity]
     if diagram.printed:
         handles.setdefault(
@@ -68,6 +70,8 @@ def _draw(axes: Any, diagram: Diagram, result: Result, handles: dict[str, Any]) 
     low, high = axes.get_ylim()
     if high < 10.0 * low:  # small changes should look small
         axes.set_ylim(math.sqrt(low * high / 10.0), math.sqrt(low * high * 10.0))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)))
+    axes.yaxis.set_major_formatter("{x:.3g}")
     axes.yaxis.set_minor_formatter("")
     if diagram.x_log:
         axes.set_xscale("log")
