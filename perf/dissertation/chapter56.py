@@ -139,9 +139,9 @@ PRINTED_RANGE = {"N": (1e-4, 1e-3), "Omega": (1e-5, 1e-4)}
 """Printed curves of Figs. 5.4, 5.5 and 6.1 on the noise-free sinusoid [deg]."""
 
 REASONS = {
-    "acceleration [mm/frame²]": "a bias of the temporal derivative filter, whose five frames see the pattern change its "
-    "speed; it is the same for all windows and rows, and twice as large with seven taps. At .003 mm/frame² the velocity "
-    "changes by 40 % of its size within the nine frames.",
+    "acceleration [mm/frame²]": "a bias of the temporal derivative filter, whose five frames see the pattern change "
+    "its speed; it is the same for all windows and rows, and twice as large with seven taps. At .003 mm/frame² the "
+    "velocity changes by 40 % of its size within the nine frames.",
 }
 """Why the worst points lie above the printed range, by the abscissa."""
 
