@@ -163,7 +163,7 @@ TABLE_41 = Experiment(
     "light of a fixed spot; f = 2800 px, 9 cameras 5 mm apart, 9 frames, 8 bit, no further noise; every fourth pixel "
     "whose window sees one face. Mean ± standard deviation over the face.",
     "Printed: the cells with a value. Texture, light and evaluated region are not printed: ours differ. Our spot "
-    "changes the brightness less: brightness constancy (INT) alone errs by hundredths of a degree, the printed one by 4.3°.",
+    "changes the brightness less: brightness constancy (INT) errs by hundredths of a degree, the printed one by 4.3°.",
     (CUBE_41,),
     (
         Table(
