@@ -31,7 +31,7 @@ def test_defaults_are_those_of_the_contract() -> None:
     assert (config.preset, config.precision, config.arch, config.preshift) == ("balanced", "f32", "auto", "auto")
     assert (config.window.size, config.window.sigma, config.window.stride) == (65, 19.0, 1)
     assert (config.window.size_time, config.window.sigma_time) == ("auto", 1.0)
-    assert (config.model.name, config.model.motion, config.model.rows) == ("auto", "rotation", "auto")
+    assert (config.model.name, config.model.motion, config.model.rows) == ("auto", "auto", "auto")
     assert (config.model.estimator, config.model.solver, config.model.weighting) == ("tls-equilibrated", "fast", "wls")
     assert (config.filters.taps, config.filters.taps_time) == ("5", "auto")
     assert config.plan.max_memory == machine_memory() // 2
@@ -182,9 +182,9 @@ def test_frame_range_beyond_the_sequence(frames: str) -> None:
     [
         (9, 1, 1, "flow-affine"),
         (1, 1, 9, "depth"),
-        (9, 1, 9, "affine-4d"),
-        (9, 5, 1, "affine-4d"),
-        (9, 5, 5, "affine-5d"),
+        (9, 1, 9, "affine-scene-flow"),
+        (9, 5, 1, "affine-scene-flow"),
+        (9, 5, 5, "affine-scene-flow"),
     ],
 )
 def test_automatic_model(n_frames: int, n_rows: int, n_cols: int, name: str) -> None:

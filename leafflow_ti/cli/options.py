@@ -22,7 +22,7 @@ Model = Annotated[
         "model",
         "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d|scene-flow|"
         "affine-scene-flow",
-        "What is estimated [auto: affine-scene-flow for a camera grid, depth without time, flow-affine for one camera].",
+        "What is estimated [auto: affine-scene-flow, depth without time, flow-affine for one camera].",
     ),
 ]
 Motion = Annotated[

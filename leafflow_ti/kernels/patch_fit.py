@@ -147,6 +147,27 @@ def patch_fit_kernel(spec: KernelSpec):
         return row
 
     @ti.func
+    def equation_error(
+        r: ti.i32, row: ti.template(), motion: ti.template(), s: ti.template(),
+        number: ti.template(), value: ti.template(),
+    ):  # fmt: skip
+        """What an equation leaves out: a share of the sizes of its terms; mixed derivatives also one of the turning."""
+        offsets = number[Number.OFFSETS]
+        code = RANGE_CODE
+        if r < 2 * offsets:
+            code = number[Number.OFFSET_CODES + r % offsets]
+        size = precise(0.0)
+        for j in ti.static(range(MAX_UNKNOWNS)):
+            size += ti.abs(row[j] * motion[j])
+        turning = precise(0.0)
+        if code == 3 or code == 4 or code == RANGE_CODE:
+            turn = ti.Vector([motion[3], motion[4], motion[5]], dt=precise).norm()
+            turning = value[Value.F] / ti.abs(s[0]) * turn * ti.sqrt(1 + s[1] * s[1] + s[2] * s[2])
+            if code != RANGE_CODE:
+                turning *= ti.abs(value[Value.BASELINE + code - 3])
+        return value[Value.MODEL_ERROR + code] * size + value[Value.TURNING_ERROR] * turning
+
+    @ti.func
     def design(
         base: ti.i32, pixel: ti.i32, stride: ti.i32, n_rows: ti.i32,
         number: ti.template(), value: ti.template(), ws: ti.template(),
@@ -160,6 +181,7 @@ def patch_fit_kernel(spec: KernelSpec):
         flow, terms, offsets = number[Number.FLOW], number[Number.TERMS], number[Number.OFFSETS]
         target = base + number[Region.DESIGN] * stride
         measured = base + number[Region.VALUE] * stride
+        left_out = base + number[Region.LEFT_OUT] * stride
         derivative = base + number[Region.DERIVATIVE] * stride
         g = base + number[Region.GEOMETRY] * stride
         q = base + number[Region.MOTION] * stride
@@ -197,6 +219,7 @@ def patch_fit_kernel(spec: KernelSpec):
                     if variant == 0:
                         for j in ti.static(range(MAX_UNKNOWNS)):
                             ws[target + (r * MAX_UNKNOWNS + j) * stride + i] = row[j]
+                        ws[left_out + r * stride + i] = equation_error(r, row, motion, s, number, value)
                     else:
                         ws[derivative + (r * terms + term) * stride + i] -= row.dot(motion) / (2 * h)
             for r in range(n_rows):
@@ -219,16 +242,11 @@ def patch_fit_kernel(spec: KernelSpec):
     def row_spread(
         base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
     ):
-        """OWN: noise of the rows; FACTOR, for the weights: that, the geometry's noise in them, and what they leave out.
-
-        What an equation leaves out is a share of the sizes of its terms.
-        """
+        """OWN: noise of the rows; FACTOR, for the weights: that, the geometry's noise in them, and what they leave out."""
         terms, offsets = number[Number.TERMS], number[Number.OFFSETS]
         cov_t = base + number[Region.COV_T] * stride
         cov_g = base + number[Region.GEOMETRY_COV] * stride
         d = base + number[Region.DERIVATIVE] * stride
-        a = base + number[Region.DESIGN] * stride
-        q = base + number[Region.MOTION] * stride
         for r in range(n_rows):
             for c in range(r + 1):
                 spread = ti.Vector.zero(precise, lanes)
@@ -238,18 +256,9 @@ def patch_fit_kernel(spec: KernelSpec):
                         spread[i] = ws[own + i]
                 small.store(ws, base + (number[Region.OWN] + tri(r, c)) * stride, spread)
                 if r == c:
-                    code = RANGE_CODE
-                    if r < 2 * offsets:
-                        code = number[Number.OFFSET_CODES + r % offsets]
-                    size = ti.Vector.zero(precise, lanes)
-                    for j in range(MAX_UNKNOWNS):
-                        one = a + (r * MAX_UNKNOWNS + j) * stride
-                        two = q + j * stride
-                        for i in range(lanes):
-                            size[i] += ti.abs(ws[one + i] * ws[two + i])
-                    share = value[Value.MODEL_ERROR + code]
+                    left_out = base + (number[Region.LEFT_OUT] + r) * stride
                     for i in range(lanes):
-                        spread[i] += share * share * size[i] * size[i]
+                        spread[i] += ws[left_out + i] * ws[left_out + i]
                 for one in range(terms):
                     da = d + (r * terms + one) * stride
                     for two in range(terms):

@@ -59,6 +59,7 @@ class Region(IntEnum):
     DIFFERENCE_COV = auto()  # [2, 9, 9]: of difference quotients of the motion along x and y
     DESIGN = auto()  # [M, 9]
     VALUE = auto()  # [M]
+    LEFT_OUT = auto()  # [M]: standard size of what each equation leaves out
     WEIGHTED = auto()  # [M, 9]: weights times design
     OWN = auto()  # packed [M]: covariance of the rows without what they owe to the geometry
     FACTOR = auto()  # packed [M]: of the weights' inverse
@@ -130,6 +131,7 @@ class Layout:
             Region.DIFFERENCE_COV: 2 * MAX_UNKNOWNS * MAX_UNKNOWNS,
             Region.DESIGN: motion * MAX_UNKNOWNS,
             Region.VALUE: motion,
+            Region.LEFT_OUT: motion,
             Region.WEIGHTED: motion * MAX_UNKNOWNS,
             Region.OWN: packed(motion),
             Region.FACTOR: packed(motion),
@@ -212,7 +214,8 @@ class Value(IntEnum):
     STEP_SIZE = SHIFT + 2  # relative step of the finite differences in the motion fit
     DENOISE = auto()  # share of the gradients' noise that is taken out of J_ff in the covariances
     MODEL_ERROR = auto()  # 7: relative, per offset code of a row, the last one of the range constraint
-    SECOND_MOMENT = MODEL_ERROR + 7  # 2: of the window along x, y, px²
+    TURNING_ERROR = MODEL_ERROR + 7  # of mixed derivatives, per turning
+    SECOND_MOMENT = TURNING_ERROR + 1  # 2: of the window along x, y, px²
     CAMERA_STEP = SECOND_MOMENT + 2  # 2: steps of an own flow's camera from the reference
     GAIN = CAMERA_STEP + 2  # noise gain of the gradient: x and y
     MIN_MASS = auto()

@@ -37,12 +37,15 @@ residual of raw TLS is no bound for the eigenvalues of the equilibrated tensor.
 What noise adds to J_ff is no structure. Taking nearly all of it leaves the matrix definite where there is nothing else,
 and makes the standard errors there ten times larger.
 """
-MODEL_ERROR = {"1": 0.0, "x": 0.05, "y": 0.05, "sx": 0.07, "sy": 0.07, "t": 0.05, "range": 0.07}
-"""What each equation of the motion fit leaves out, as a share of the sizes of its terms; by the offset of its row.
+MODEL_ERROR = {"1": 0.0, "x": 0.05, "y": 0.05, "sx": 0.03, "sy": 0.03, "t": 0.05, "range": 0.03}
+TURNING_ERROR = 0.01
+"""What each equation of the motion fit leaves out: a share of the sizes of its terms, by the offset of its row; and
+of the mixed derivatives ``a_s`` and ``b_t`` also a share of ``nu |Ω| (1 + ZX² + ZY²)^1/2``.
 
-Noise is not all: on steep and turning surfaces the affine model's derivatives are off by some per cent without any
-(the mixed ones, ``a_s`` and ``b_t``, most: 1-3 % on a turning 60° face), while the flow itself is not. Weights that
-know of the noise alone stake everything on the derivatives where images are good.
+Noise is not all: on steep and turning surfaces the affine model's derivatives are off by some per cent without any, the
+mixed ones in proportion to the turning (a_s by .0026 of the above on a 60° face), while the flow itself is not.
+Weights that know of the noise alone stake everything on the derivatives where images are good. That ``a_s`` and ``b_t``
+measure one derivative from the same noise, which the weights leave out, is one more reason for a share.
 """
 STEP_SIZE = {"f64": 1e-4, "f32": 1e-2}
 MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
@@ -279,6 +282,7 @@ class EstimateStage:
         for code, name in enumerate(("1", *AXES, "range")):
             value[Value.MODEL_ERROR + code] = MODEL_ERROR[name]
         assert len(AXES) + 1 == RANGE_CODE
+        value[Value.TURNING_ERROR] = TURNING_ERROR
         value[Value.SECOND_MOMENT : Value.SECOND_MOMENT + 2] = sampling.x.moment(2), sampling.y.moment(2)
         # Windows that do not overlap from one frame to the next share no content that could be followed.
         value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size)

@@ -331,6 +331,12 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         if has_range:
             D[-1, it] += 1.0
         floor = np.array([estimate.MODEL_ERROR[code] for code in codes]) * (np.abs(A) @ np.abs(q))
+        Z0, ZX, ZY, _ = surface(x0, y0, f, *surface_terms)
+        turning = f / Z0 * np.linalg.norm(q[3:6]) * np.sqrt(1 + ZX**2 + ZY**2)
+        for i, code in enumerate(codes):
+            if code in ("sx", "sy", "range"):
+                steps = {"sx": abs(baseline[0]), "sy": abs(baseline[1]), "range": 1.0}[code]
+                floor[i] += estimate.TURNING_ERROR * turning * steps
         return A, value, C, D, shared, np.diag(floor**2), codes
 
     def reference_rows(q):
