@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     for case in (case for case in CASES if case.name in options.names):
         began = time.perf_counter()
         try:
-            outcome = case.load()(Options(options.out, options.quick))
+            outcome = case.load()(Options(options.out, options.quick, case.name))
         except LeafflowError as error:
             print(f"error: {case.name}: {error}", file=sys.stderr)
             return error.exit_code

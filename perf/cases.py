@@ -7,15 +7,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from perf.dissertation.goals import EXPERIMENTS
 from perf.figures import Outcome
 
 
 @dataclass(frozen=True)
 class Options:
-    """``out``: folder for pictures. ``quick``: a smaller version of the case, for a first look and for tests."""
+    """``out``: folder for pictures. ``quick``: a smaller version of the case, for a first look and for tests.
+    ``case``: the name under which it was called."""
 
     out: Path
     quick: bool = False
+    case: str = ""
 
 
 @dataclass(frozen=True)
@@ -34,17 +37,14 @@ class Case:
 
 
 CASES = (
-    Case(
-        "table-3.1",
-        "table31:run",
-        "depth and slope of a sinusoidal plane, 1D and 2D grid, four orientations (Table 3.1)",
-    ),
+    Case("dissertation", "dissertation.case:run", "all tables and figures of the dissertation below, as one page"),
+    Case("dissertation-page", "dissertation.case:run", "the page once more, from the values that are there"),
+    *(Case(e.name, "dissertation.case:run", e.title) for e in EXPERIMENTS),
     Case(
         "sinusoid",
         "sinusoid:run",
         "motion of a sinusoidal plane in 4D, with and without noise, error bars (section 5.3)",
     ),
-    Case("cube", "cube:run", "rotating cube: motion, rotation and depth per face and set of rows (Table 5.1)"),
     Case(
         "hci-cotton", "cotton:run", "real 9x9 light field: disparity and normals of the whole image against its truth"
     ),

@@ -20,13 +20,14 @@ Array = NDArray[Any]
 @dataclass(frozen=True, eq=False)
 class Panel:
     """One image [y, x], or colours [y, x, 3]. ``limits`` of the colours; ``arrows`` [y, x, 2] drawn on it, NaN where
-    none; those three times as long as most are left out."""
+    none, one every ``arrow_step`` pixels; those three times as long as most are left out."""
 
     title: str
     image: Array
     limits: tuple[float, float] | None = None
     colours: str = "viridis"
     arrows: Array | None = None
+    arrow_step: int | None = None
 
 
 def normal_colours(normals: Array) -> Array:
@@ -73,7 +74,7 @@ def _draw_panel(figure: Any, axes: Any, panel: Panel) -> None:
     if panel.image.ndim == 2:
         figure.colorbar(shown, ax=axes, shrink=0.85)
     if panel.arrows is not None:
-        step = max(1, max(panel.image.shape[:2]) // 40)
+        step = panel.arrow_step or max(1, max(panel.image.shape[:2]) // 40)
         y, x = np.mgrid[step // 2 : panel.image.shape[0] : step, step // 2 : panel.image.shape[1] : step]
         u, v = panel.arrows[y, x, 0], panel.arrows[y, x, 1]
         length = np.hypot(u, v)

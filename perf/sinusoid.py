@@ -7,17 +7,17 @@ of error to standard error tells whether the error bars are true.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.capture import Geometry, capture_from_array
 from leafflow_ti.errors import RunError
 from leafflow_ti.metrics import Maps, aae, coverage
-from leafflow_ti.synthetic.plane import PlaneScene, render, sinusoid_scene, truth
+from leafflow_ti.synthetic.plane import PlaneScene, truth
 from perf.cases import Options
+from perf.dissertation.scenes import capture, middle, sinusoid
 from perf.figures import Figure, Outcome
 
 COVERED = ("depth", "slope_x", "slope_y", "velocity_x", "velocity_y", "velocity_z")
@@ -26,15 +26,12 @@ TRUE_NAMES = {"depth": "depth", "slope_x": "zx", "slope_y": "zy"}
 
 @dataclass(frozen=True)
 class Settings:
-    """``region_px`` in the middle of the image, every ``stride``-th pixel; ``noise`` in grey values of a range of
-    100."""
+    """Every ``stride``-th pixel in the middle of the image; ``noise`` in grey values of a range of 100."""
 
     size_px: int = 221
-    region_px: int = 33
     stride: int = 8
     window: int = 65
     sigma: float = 19.0
-    preshift_px: int = -14
     noise: float = 2.5
     seeds: int = 40
 
@@ -45,12 +42,9 @@ def estimate_region(
     """Maps of the region, and the truth there by the same names as ``truth``."""
     from leafflow_ti.api import estimate
 
-    capture = capture_from_array(render(plane), Geometry(plane.f_px, plane.principal, (plane.baseline_mm[0], 0.0)))
-    first = (settings.size_px - settings.region_px) // 2
-    last = first + settings.region_px
     field = estimate(
-        capture, model="affine-4d", motion="rotation", preshift=(settings.preshift_px, 0), window=settings.window,
-        sigma=settings.sigma, stride=settings.stride, roi=(first, first, last, last), precision=precision,
+        capture(plane, plane.seed), model="affine-4d", motion="rotation", preshift=(-14, 0), window=settings.window,
+        sigma=settings.sigma, stride=settings.stride, roi=middle(plane), precision=precision,
     )  # fmt: skip
     there = np.ix_(field.y, field.x)
     true = {name: values if values.ndim == 1 else values[there] for name, values in truth(plane).items()}
@@ -78,7 +72,7 @@ def measure(settings: Settings) -> Outcome:
     size = (settings.size_px, settings.size_px)
     figures = []
     for precision in ("f64", "f32"):
-        found = _errors(*estimate_region(sinusoid_scene(0.0, size), settings, precision))
+        found = _errors(*estimate_region(sinusoid(size=size), settings, precision))
         figures += [
             Figure(f"AAE of N, noise free, {precision}", found["velocity"], "deg", 3e-4),
             Figure(f"AAE of Omega, noise free, {precision}", found["rotation"], "deg", 2e-5),
@@ -89,8 +83,7 @@ def measure(settings: Settings) -> Outcome:
         figures.append(Figure(f"{one.name.split(',')[0]}, f32 over f64", other.value / one.value, "", 1.1))
     noisy = []
     for seed in range(settings.seeds):
-        plane = replace(sinusoid_scene(settings.noise, size), seed=seed)
-        noisy.append(estimate_region(plane, settings, "f32"))
+        noisy.append(estimate_region(sinusoid(size=size, noise=settings.noise, seed=seed), settings, "f32"))
     means: Mapping[str, float] = {
         name: float(np.mean([_errors(maps, true)[name] for maps, true in noisy])) for name in ("velocity", "rotation")
     }

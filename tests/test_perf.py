@@ -1,17 +1,16 @@
-"""The perf runner: it lists its cases, refuses unknown ones, and a tiny case runs to the printed table and to JSON."""
+"""The perf runner: it lists its cases, refuses unknown ones, and shows figures as text and JSON."""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from leafflow_ti.errors import InputError
-from perf import stages, table31
+from perf import stages
 from perf.__main__ import main
 from perf.cases import CASES, Case
 from perf.figures import Figure, Outcome, to_json, to_text
@@ -65,15 +64,6 @@ def test_text_and_json_say_the_same() -> None:
     assert found["settings"] == {"window": 9}
     assert [figure["value"] for figure in found["figures"]] == [2.0, None]
     assert found["figures"][0]["met"] is False
-
-
-def test_a_tiny_table_runs_and_its_noise_free_cells_are_met() -> None:
-    settings = replace(table31.Settings(), cameras=5, window=33, sigma=7.0, region_px=5, seeds=1, alphas=(0,))
-    outcome = table31.measure(settings)
-    assert len(outcome.figures) == 8
-    # The printed values of this orientation are two orders of magnitude above what exact images allow.
-    assert all(figure.met for figure in outcome.figures if "noise 0 %" in figure.name)
-    assert json.loads(to_json("table-3.1", outcome, 0.0))["skipped"] is None
 
 
 def test_the_scipy_twin_computes_what_is_timed() -> None:
