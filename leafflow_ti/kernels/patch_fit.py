@@ -242,7 +242,7 @@ def patch_fit_kernel(spec: KernelSpec):
     def row_spread(
         base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
     ):
-        """OWN: noise of the rows; FACTOR, for the weights: that, the geometry's noise in them, and what they leave out."""
+        """OWN: noise of the rows; FACTOR, for the weights: that, the geometry's noise in them, what they leave out."""
         terms, offsets = number[Number.TERMS], number[Number.OFFSETS]
         cov_t = base + number[Region.COV_T] * stride
         cov_g = base + number[Region.GEOMETRY_COV] * stride
