@@ -167,5 +167,5 @@ def _provenance(plan: Plan, capture: Capture, device: Device) -> dict[str, Any]:
         "leafflow_ti_version": __version__,
         "versions": {"python": platform.python_version()} | {p: installed(p) for p in ("taichi", "numpy", "zarr")},
         "device": str(device),
-        "input": capture.fingerprint(),
+        "input": capture.fingerprint() | (plan.ranges.given.fingerprint() if plan.ranges and plan.ranges.given else {}),
     }  # fmt: skip

@@ -23,11 +23,13 @@ from leafflow_ti.field import quantity
 Preset = Literal["fast", "balanced", "accurate"]
 ModelName = Literal[
     "auto", "flow", "flow-affine", "flow-quadratic", "depth", "affine-translation", "affine", "affine-4d", "affine-5d",
-    "scene-flow", "affine-scene-flow",
+    "scene-flow", "affine-scene-flow", "range-flow",
 ]  # fmt: skip
 Motion = Literal["auto", "translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
+Deformation = Literal["auto", "none", "growth"]
 BrightnessTerms = Literal["none", "time", "space", "both"]
+Constraint = Literal["int", "grad", "intgrad", "taylor"]
 Estimator = Literal["ols", "tls", "tls-equilibrated"]
 Solver = Literal["fast", "jacobi"]
 Prefilter = Literal["none", "highpass", "homomorphic"]
@@ -127,11 +129,13 @@ class ModelSection(_Section):
     """Which parameters are estimated, and how.
 
     ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its derivatives along x, y) followed by
-    any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can.
+    any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can. ``deformation`` growth:
+    the patch may grow in its plane, one more unknown; auto: where the flows of all cameras are there to tell.
     """
 
     name: ModelName = "auto"
     motion: Motion = "auto"
+    deformation: Deformation = "auto"
     rows: str = "auto"
     brightness: Brightness = "none"
     brightness_terms: BrightnessTerms = "none"
@@ -188,6 +192,15 @@ class FiltersSection(_Section):
     taps_camera: _AutoTaps = "auto"
     prefilter: Prefilter = "none"
     sigma_pre: _Width = 8.0
+
+
+class RangeFlowSection(_Section):
+    """Range flow: constraint on the intensity, its weight ``beta`` against the range beyond what their noise says, and
+    ``depth``: given range maps instead of our own (results store, stack, or pattern with ``{t}``)."""
+
+    constraint: Constraint = "taylor"
+    beta: _Width = 1.0
+    depth: str | None = None
 
 
 class PlanSection(_Section):
@@ -262,6 +275,7 @@ class RunConfig(_Section):
     model: ModelSection = ModelSection()
     window: WindowSection = WindowSection()
     filters: FiltersSection = FiltersSection()
+    range_flow: RangeFlowSection = RangeFlowSection()
     plan: PlanSection = Field(default_factory=PlanSection)
     output: OutputSection = OutputSection()
 
@@ -309,6 +323,7 @@ KEYWORDS: dict[str, str] = {
     "window": "window.size",
     **{name: f"window.{name}" for name in WindowSection.model_fields if name != "size"},
     **{name: f"filters.{name}" for name in FiltersSection.model_fields},
+    **{name: f"range_flow.{name}" for name in RangeFlowSection.model_fields},
     **{name: f"plan.{name}" for name in PlanSection.model_fields},
     **{name: f"output.{name}" for name in OutputSection.model_fields},
 }
@@ -376,6 +391,9 @@ def _read_file(path: Path) -> dict[str, tuple[object, str]]:
     mask = given.get("output.mask")
     if mask is not None and isinstance(mask[0], str):
         given["output.mask"] = (path.parent / mask[0], mask[1])
+    depth = given.get("range_flow.depth")
+    if depth is not None and isinstance(depth[0], str):
+        given["range_flow.depth"] = (str(path.parent / depth[0]), depth[1])
     return given
 
 

@@ -15,7 +15,7 @@ leads from there to the value at the centre.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 
@@ -40,7 +40,7 @@ class Model:
     ``cameras``: ``"reference"`` (one camera), ``"line"`` (the row or column through the reference camera) or
     ``"grid"``. ``curvature``: further flow columns, (channel, offset). ``motions``: what the 3D fit may solve for, the
     default first. ``own_flows``: every camera's own flow (6.15) enters the fit; ``reference_rows``: so do the rows of
-    the reference camera.
+    the reference camera. ``ranges``: measures on maps of the range too; its columns are those of ``range_flow``.
     """
 
     offsets: tuple[str, ...]
@@ -51,6 +51,7 @@ class Model:
     motions: tuple[str, ...] = ()
     own_flows: bool = False
     reference_rows: bool = True
+    ranges: bool = False
 
 
 ANY_MOTION = ("rotation", "translation", "acceleration")
@@ -76,6 +77,10 @@ MODELS: dict[str, Model] = {
     "affine-scene-flow": Model(
         ("x", "y", "s", "t"), "grid", True, "4D or 5D affine model and the affine flow of every camera (6.15)",
         motions=ANY_MOTION, own_flows=True,
+    ),
+    "range-flow": Model(
+        (), "grid", True, "velocity from range and intensity (3.9)-(3.18), (4.20)-(4.25)",
+        motions=("translation",), ranges=True,
     ),
 }  # fmt: skip
 """``flow-quadratic``: the flow of a plane has ``(q1 x² + q2 xy, q1 xy + q2 y²)`` (2.8); here the four coefficients are
@@ -139,11 +144,29 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Derived:
+    """A channel that is made of a stack of images: the derivative along ``axis`` of one of them, times a plane.
+
+    ``axis`` ``i`` is the smoothed image, ``1`` a constant; ``image`` and ``factor`` count in the stacks of images and
+    of factor planes (None: no factor). ``gain``: noise variance per variance of the image noise.
+    """
+
+    image: int
+    axis: str
+    factor: int | None
+    gain: float
+
+
+@dataclass(frozen=True)
 class ColumnSet:
-    """The data vector of one model on one sampling: ``columns`` with the ``n_time_like`` time-like ones last."""
+    """The data vector of one model on one sampling: ``columns`` with the ``n_time_like`` time-like ones last.
+
+    ``derived``: how each channel is made where the images of a frame are a stack of several kinds, the intensity first.
+    """
 
     columns: tuple[Column, ...]
     n_time_like: int
+    derived: Mapping[str, Derived] = field(default_factory=dict, hash=False)
 
     @property
     def n(self) -> int:

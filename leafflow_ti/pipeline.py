@@ -21,6 +21,7 @@ from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.plan import Plan, Unit
+from leafflow_ti.range_engine import RangeEngine, Sample
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import EstimateStage, View
 from leafflow_ti.stages.prefilter import Prefilter
@@ -60,15 +61,17 @@ class _Engine:
     estimate: EstimateStage
     inner: tuple[slice, slice]
     own_cameras: list[tuple[slice, slice]]
+    ranges: RangeEngine | None = None
 
     def reset(self) -> None:
         """Forget all frames."""
         for stage in (self.tensor, *self.own):
             stage.reset()
 
-    def push(self, block: NDArray[Any], valid: NDArray[np.bool_]) -> tuple[Any, list[Any]] | None:
-        """Add a frame [sy, sx, rows, cols] of every camera; the tensors once the windows are full."""
-        tensor = self.tensor.push(block[self.inner], valid)
+    def push(self, sample: Sample) -> tuple[Any, list[Any]] | None:
+        """Add a frame of every camera; the tensors once the windows are full."""
+        block, valid = sample.block, sample.valid
+        tensor = self.tensor.push(block[self.inner], valid, sample.factors)
         own = [stage.push(block[at], valid) for stage, at in zip(self.own, self.own_cameras, strict=True)]
         return None if tensor is None else (tensor, own)
 
@@ -101,10 +104,17 @@ class Pipeline:
             band = Band.of(plan.problem.sampling, 1, 1, plan.config.window.stride)
             engine = self._make_engine(band)
             shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
+            if engine.ranges:
+                shape = (*shape[:2], engine.ranges.outer.in_rows, engine.ranges.outer.in_cols)
+                engine.ranges.move(engine.estimate.view, (0, 0))
             grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
+            ok = np.ones(shape[2:], bool)
+            sample = Sample(grey, ok, np.zeros(shape[2:], np.uint8))
+            if engine.ranges:
+                sample = engine.ranges.sample(plan.frames[0], grey, ok, ok)
             tensors = None
             while tensors is None:
-                tensors = engine.push(grey, np.ones(shape[2:], bool))
+                tensors = engine.push(sample)
             engine.estimate(*tensors)
             self.device.synchronize()
         return self.timings.seconds["compile"]
@@ -121,10 +131,12 @@ class Pipeline:
         plan, problem = self.plan, self.plan.problem
         tensor = TensorStage(self.device, problem.columns, plan.layout, problem.sampling, band)
         view = self._view((0, 0), band, tensor.out_pitch)
+        ranges = RangeEngine(self.device, plan.ranges, problem.sampling, view, band) if plan.ranges else None
+        read = ranges.outer if ranges else band
         filters = plan.config.filters
         prefilter = None
         if filters.prefilter != "none":
-            prefilter = Prefilter(self.device, filters.prefilter, filters.sigma_pre, band.in_rows, band.in_cols)
+            prefilter = Prefilter(self.device, filters.prefilter, filters.sigma_pre, read.in_rows, read.in_cols)
         own = problem.own_flows
         stages: list[TensorStage] = []
         places: list[tuple[slice, slice]] = []
@@ -138,7 +150,8 @@ class Pipeline:
             first, (problem.sampling.sy, problem.sampling.sx), strict=True
         ))  # fmt: skip
         estimate = EstimateStage(self.device, problem, plan.layout, view, bool(plan.margin))
-        return _Engine(prefilter, tensor, stages, estimate, (sy, sx), places)
+        inner = (slice(None), slice(None)) if ranges else (sy, sx)  # range flow's block is one stack of images
+        return _Engine(prefilter, tensor, stages, estimate, inner, places, ranges)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
         """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.
@@ -146,7 +159,7 @@ class Pipeline:
         ``pair``: where the axis stands in pairs (x, y); cameras are (rows, columns).
         """
         plan = self.plan
-        reach = plan.problem.sampling.axis(axis).radius if plan.config.window.border == "full" else 0
+        reach = plan.reach(axis) if plan.config.window.border == "full" else 0
         shifts = [plan.preshift[pair] * (k - self.capture.reference[1 - pair]) for k in plan.cameras[1 - pair]]
         first, last = reach - min(shifts), size - 1 - reach - max(shifts)
         inside = [i for i, p in enumerate(positions) if first <= p <= last]
@@ -183,22 +196,29 @@ class Pipeline:
         engine.reset()
         engine.estimate.set_view(self._view((rows.start, cols.start), band, engine.tensor.out_pitch))
         corner = (self._y[rows.start] - band.halo_y, self._x[cols.start] - band.halo_x)
-        inside, kept = self._inside(band, corner)
         centre = _centres(band)
+        if engine.ranges:
+            band, corner = engine.ranges.outer, engine.ranges.move(engine.estimate.view, corner)
+        allowed = self._inside(band, corner)
         place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
         latency = engine.tensor.latency
-        finite: dict[int, NDArray[np.bool_]] = {}
+        samples: dict[int, Sample] = {}
         for t in range(plan.frames[first] - latency, plan.frames[last] + latency + 1):
-            block, finite[t] = self._read(t, band, corner, engine.prefilter)
+            block, finite = self._read(t, band, corner, engine.prefilter)
             with self.timings.of("tensor"):
-                tensors = engine.push(block, inside & kept & finite[t])
+                if engine.ranges:
+                    samples[t] = engine.ranges.sample(t, block, allowed & finite, finite)
+                else:
+                    status = np.where(finite, np.uint8(Status.OK), np.uint8(Status.NOT_FINITE))
+                    samples[t] = Sample(block, allowed & finite, status)
+                tensors = engine.push(samples[t])
                 self.device.synchronize()
             frame = t - latency
-            finite.pop(frame - 1, None)
+            samples.pop(frame - 1, None)
             if tensors is None:
                 continue
             with self.timings.of("estimate"):
-                maps, status = self._maps(engine.estimate(*tensors), finite[frame][centre])
+                maps, status = self._maps(engine.estimate(*tensors), samples[frame], centre)
                 unit = plan.unit(first + frame - plan.frames[first], index)
                 result = self._frame_of(index, maps, status, place)
             yield unit, *result
@@ -285,28 +305,33 @@ class Pipeline:
         in_y, in_x = y + shift[1] * rows, x + shift[0] * cols
         return (in_y >= 0) & (in_y < capture.height), (in_x >= 0) & (in_x < capture.width)
 
-    def _inside(self, band: Band, corner: tuple[int, int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Where every camera sees its image, and where the mask allows a measurement: [in_rows, in_cols]."""
+    def _inside(self, band: Band, corner: tuple[int, int]) -> NDArray[np.bool_]:
+        """Where every camera sees its image and the mask allows a measurement: [in_rows, in_cols]."""
         capture = self.capture
         y, x = corner[0] + np.arange(band.in_rows), corner[1] + np.arange(band.in_cols)
         in_y, in_x = (np.logical_and.reduce(seen) for seen in self._seen(y, x))
         inside = in_y[:, None] & in_x
         if self._mask is None:
-            return inside, np.ones_like(inside)
+            return np.asarray(inside)
         kept = self._mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
-        return inside, kept
+        return np.asarray(inside & kept)
 
-    def _maps(self, planes: NDArray[Any], finite: NDArray[np.bool_]) -> tuple[Maps, NDArray[np.uint8]]:
+    def _maps(
+        self, planes: NDArray[Any], sample: Sample, centre: tuple[slice, slice]
+    ) -> tuple[Maps, NDArray[np.uint8]]:
         """Named maps and the status of the measured rectangle."""
         from leafflow_ti.kernels.maps import Output
 
         status = planes[Output.STATUS].astype(np.uint8)
-        status[~finite] = Status.NOT_FINITE
+        reason = sample.status[centre]
+        status[reason != Status.OK] = reason[reason != Status.OK]
         maps = {}
         for name in self._names:
             base = name.removesuffix("_std")
-            plane = _plane_of(base) + (Output.STD if name != base else 0)
-            maps[name] = planes[plane].astype(np.float32)
+            if name in sample.maps:
+                maps[name] = sample.maps[name][centre].astype(np.float32)
+            else:
+                maps[name] = planes[_plane_of(base) + (Output.STD if name != base else 0)].astype(np.float32)
         has_value = np.isin(status, HAS_VALUE)
         for values in maps.values():
             # A degenerate window can defeat the arithmetic: no NaN without a status that says so.

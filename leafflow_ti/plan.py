@@ -1,6 +1,7 @@
 """The plan of a run, a pure value: what is computed, from which windows, in which units, with how much memory.
 
-It is what ``--dry-run`` prints and what the pipeline executes. Making it reads grey values only to find a preshift.
+It is what ``--dry-run`` prints and what the pipeline executes. Making it reads grey values only to find a preshift, and
+for range flow the noise of one image.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from leafflow_ti.config import RunConfig, resolve_model
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import choose_filter_set, filter_set
 from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set, parse_rows
+from leafflow_ti.range_plan import RangePlan, range_problem
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.prefilter import prefilter_bytes
@@ -53,6 +55,12 @@ class Plan:
     band_rows: int
     bytes: int
     """Memory of the largest unit's arrays."""
+    ranges: RangePlan | None = None
+
+    def reach(self, axis: str) -> int:
+        """Pixels that a measurement needs on each side along an image axis."""
+        sampling = self.problem.sampling
+        return sampling.axis(axis).radius + (self.ranges.reach(sampling, axis) if self.ranges else 0)
 
     @property
     def bands(self) -> int:
@@ -86,8 +94,9 @@ class Plan:
             names += ["disparity", "depth"]
         if "x" in problem.terms:
             names += ["slope_x", "slope_y"]
+        names += self.ranges.quantities if self.ranges else ()
         names += MOTION_NAMES[: problem.unknowns]
-        if "t" in problem.columns.solutions:
+        if "t" in problem.columns.solutions and not self.ranges:
             names += ["flow_x", "flow_y"]
         if problem.columns.index("i") is not None:
             names += [f"brightness_{a}" for a in problem.camera_axes]
@@ -131,7 +140,9 @@ class Plan:
             f"estimator   {problem.estimator}, solver {problem.solver}, "
             f"{'weighted' if problem.weighted else 'plain'} least squares",
         ]
-        if problem.unknowns:
+        if self.ranges:
+            lines.append(self.ranges.describe())
+        elif problem.unknowns:
             rows = "+".join(problem.offsets) + ("+b5" if problem.use_range else "")
             n_rows = 2 * len(problem.offsets) + problem.use_range
             own = problem.own_flows
@@ -141,7 +152,8 @@ class Plan:
                     f"{2 * len(own.offsets)} rows ({'+'.join(own.offsets)}) of each of {len(own.steps)} cameras' own "
                     f"flow, {own.columns.n} columns"
                 )
-            lines.append(f"motion      {problem.unknowns} unknowns from {' and '.join(taken)}")
+            growing = " and growth" if own and own.growth else ""
+            lines.append(f"motion      {problem.unknowns} unknowns{growing} from {' and '.join(taken)}")
         pixels = len(self.frames) * len(self.y) * len(self.x)
         limit = self.config.plan.max_memory
         filters = self.config.filters
@@ -168,31 +180,78 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     """
     name = resolve_model(config.model.name, capture.n_frames, capture.n_rows, capture.n_cols)
     model = MODELS[name]
-    _check_model(name, capture)
+    if not (model.ranges and config.range_flow.depth):
+        _check_model(name, capture)
     if config.filters.prefilter == "highpass" and config.model.brightness != "none":
         raise ConfigError(
             f"brightness '{config.model.brightness}' is relative to the grey value, which prefilter 'highpass' takes "
             "away: choose prefilter homomorphic, or brightness none"
         )
+    if config.model.deformation == "growth" and not model.own_flows:
+        raise ConfigError(
+            f"deformation 'growth': model '{name}' cannot tell it from approach: choose affine-scene-flow"
+        )
+    motion = _motion(config, name)
+    preshift, ranges = (0, 0), None
+    if model.ranges:
+        own = None if config.range_flow.depth else _problem(capture, _static(config), "depth", None)
+        preshift = _preshift(capture, config) if own else (0, 0)
+        alone = _sampling(capture, config, "reference", True)
+        frames = _frames(capture, config, alone.t.radius, True)
+        problem, ranges = range_problem(capture, config, alone, frames, own, preshift)
+    else:
+        problem = _problem(capture, config, name, motion)
+        frames = _frames(capture, config, problem.sampling.t.radius, model.time)
+        preshift = _preshift(capture, config) if problem.camera_axes else (0, 0)
+    layout = TensorLayout.of(problem.columns)
+    x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
+    if x1 > capture.width or y1 > capture.height:
+        size = f"{capture.width} x {capture.height}"
+        raise ConfigError(
+            f"output.roi = {x0},{y0},{x1},{y1} reaches beyond the images of {size} pixels: make it smaller"
+        )
+    x, y = range(x0, x1, config.window.stride), range(y0, y1, config.window.stride)
+    grid = (ranges.depth if ranges and ranges.depth else problem).sampling
+    cameras = _cameras(grid, problem.own_flows, *capture.reference)
+    n_cameras = len(cameras[0]) * len(cameras[1])
+    band_rows, memory = _band_rows(config, problem, layout, ranges, n_cameras, len(y), len(x))
+    return Plan(
+        config, name, problem, layout, _geometry(capture),
+        cameras, preshift, frames, y, x, band_rows, memory, ranges,
+    )  # fmt: skip
+
+
+def _sampling(capture: Capture, config: RunConfig, cameras: str, time: bool) -> Sampling:
+    """Filters and windows for ``cameras`` as ``models.Model`` has them, with or without a temporal axis."""
     row, col = capture.reference
-    use_x = capture.n_cols > 1 and model.cameras != "reference"
-    use_y = capture.n_rows > 1 and (model.cameras == "grid" or (model.cameras == "line" and not use_x))
+    use_x = capture.n_cols > 1 and cameras != "reference"
+    use_y = capture.n_rows > 1 and (cameras == "grid" or (cameras == "line" and not use_x))
     w = config.window
     camera = ("cameras", config.filters.taps_camera, w.size_camera, w.sigma_camera, config.filters.taps)
-    time = ("frames", config.filters.taps_time, w.size_time, w.sigma_time, config.filters.taps)
+    frames = ("frames", config.filters.taps_time, w.size_time, w.sigma_time, config.filters.taps)
     pixel = AxisSampling.gaussian(filter_set(config.filters.taps), w.size, w.sigma)
-    sampling = Sampling(
+    return Sampling(
         pixel,
         pixel,
         _series(capture.n_cols, col, *camera) if use_x else AxisSampling(),
         _series(capture.n_rows, row, *camera) if use_y else AxisSampling(),
-        _series(capture.n_frames, capture.n_frames // 2, *time, sequence=True) if model.time else AxisSampling(),
+        _series(capture.n_frames, capture.n_frames // 2, *frames, sequence=True) if time else AxisSampling(),
     )
+
+
+def _static(config: RunConfig) -> RunConfig:
+    """The configuration for the depth of single frames: the motion's own choices do not concern it."""
+    return config.model_copy(update={"model": config.model.model_copy(update={"brightness_terms": "none"})})
+
+
+def _problem(capture: Capture, config: RunConfig, name: str, motion: str | None) -> Problem:
+    """What a model (but range flow) estimates."""
+    model = MODELS[name]
+    row, col = capture.reference
+    sampling = _sampling(capture, config, model.cameras, model.time)
     columns = column_set(
         model, config.model.brightness, sampling.camera_axes, sampling.sampled, config.model.brightness_terms
     )
-    grid = bool(sampling.camera_axes)
-    motion = _motion(config, name)
     offsets: tuple[str, ...] = ("1",)
     use_range, fitted, own = False, 0, None
     if motion:
@@ -209,26 +268,9 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
                 f"motion '{motion}' has {fitted} unknowns, rows '{config.model.rows}' give {n_rows} equations: choose "
                 "more rows, a simpler motion, or more frames and cameras"
             )
-    problem = Problem(
+    return Problem(
         columns, sampling, config.model.estimator, config.model.solver, config.model.weighting == "wls",
         offsets, use_range, fitted, own,
-    )  # fmt: skip
-    layout = TensorLayout.of(columns)
-    x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
-    if x1 > capture.width or y1 > capture.height:
-        size = f"{capture.width} x {capture.height}"
-        raise ConfigError(
-            f"output.roi = {x0},{y0},{x1},{y1} reaches beyond the images of {size} pixels: make it smaller"
-        )
-    x, y = range(x0, x1, w.stride), range(y0, y1, w.stride)
-    cameras = _cameras(sampling, own, row, col)
-    n_cameras = len(cameras[0]) * len(cameras[1])
-    band_rows, memory = _band_rows(config, problem, layout, n_cameras, len(y), len(x))
-    return Plan(
-        config, name, problem, layout, _geometry(capture),
-        cameras,
-        _preshift(capture, config) if grid else (0, 0),
-        _frames(capture, config, sampling.t.radius, model.time), y, x, band_rows, memory,
     )  # fmt: skip
 
 
@@ -262,7 +304,10 @@ def _own_flows(
         steps.remove((0, 0))
     unknowns = {"translation": 3, "rotation": 6, "acceleration": 9}[motion]
     kept = tuple(o for o in offsets if o == "1" or columns.index("x", o) is not None)
-    return OwnFlows(columns, alone, tuple(steps), kept, unknowns, model.reference_rows)
+    growth = "x" in kept if config.model.deformation == "auto" else config.model.deformation == "growth"
+    if growth and "x" not in kept:
+        raise ConfigError("deformation 'growth' is seen in the flow's derivatives: choose rows that begin with 2d")
+    return OwnFlows(columns, alone, tuple(steps), kept, unknowns, model.reference_rows, growth)
 
 
 def _cameras(sampling: Sampling, own: OwnFlows | None, row: int, col: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -281,6 +326,10 @@ def _cameras(sampling: Sampling, own: OwnFlows | None, row: int, col: int) -> tu
 def _check_model(name: str, capture: Capture) -> None:
     model = MODELS[name]
     cameras = capture.n_rows * capture.n_cols
+    if model.ranges and cameras == 1:
+        raise ConfigError(
+            "model 'range-flow' needs a camera grid or range maps, the capture has one camera: give --depth"
+        )
     if model.cameras != "reference" and cameras == 1:
         raise ConfigError(f"model '{name}' needs a camera grid, the capture has one camera: choose flow or flow-affine")
     if model.time and capture.n_frames < 3:
@@ -337,7 +386,13 @@ def _preshift(capture: Capture, config: RunConfig) -> tuple[int, int]:
 
 
 def _band_rows(
-    config: RunConfig, problem: Problem, layout: TensorLayout, n_cameras: int, rows: int, cols: int
+    config: RunConfig,
+    problem: Problem,
+    layout: TensorLayout,
+    ranges: RangePlan | None,
+    n_cameras: int,
+    rows: int,
+    cols: int,
 ) -> tuple[int, int]:
     """Rows of a unit, and the memory that it takes."""
     itemsize = 4 if config.precision == "f32" else 8
@@ -346,13 +401,18 @@ def _band_rows(
         # Two more rows and columns for the growth at the edges.
         band = Band.of(problem.sampling, n + 2, cols + 2, config.window.stride)
         total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
+        read = band
+        if ranges and ranges.depth and ranges.layout:
+            depth = ranges.depth
+            read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
+            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize)
         own = problem.own_flows
         if own:
             total += len(own.steps) * band_bytes(
                 own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize
             )
         if config.filters.prefilter != "none":
-            total += prefilter_bytes(config.filters.sigma_pre, n_cameras, band.in_rows, band.in_cols, itemsize)
+            total += prefilter_bytes(config.filters.sigma_pre, n_cameras, read.in_rows, read.in_cols, itemsize)
         return total
 
     limit = int(0.8 * config.plan.max_memory)

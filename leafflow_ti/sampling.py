@@ -121,9 +121,12 @@ def column_noise(sampling: Sampling, columns: ColumnSet) -> Array:
     squares are centred.
     """
 
+    def gain(channel: str) -> float:
+        return columns.derived[channel].gain if channel in columns.derived else noise_gain(sampling, channel)
+
     def of(column: Column) -> float:
         return sum(
-            p.factor * q.factor * noise_gain(sampling, p.channel) * sampling.moment(_sum(p.exponents, q.exponents))
+            p.factor * q.factor * gain(p.channel) * sampling.moment(_sum(p.exponents, q.exponents))
             for p, q in product(column.terms, repeat=2)
             if (p.channel, p.vector) == (q.channel, q.vector)
         )

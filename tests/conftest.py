@@ -33,7 +33,7 @@ CASES = [
     if (row.cameras == "reference") == (grid == "single")
     if model != "affine-5d" or grid == "square"
     if row.time or brightness != "temporal"
-    if not row.own_flows
+    if not row.own_flows and not row.ranges
 ]
 """Every tensor with every brightness model and every grid that it exists for."""
 
@@ -266,7 +266,10 @@ class Bench:
                 sampling, columns = self.own_columns
                 own = tuple(o for o in offsets if columns.index("x", o) is not None) if model.reference_rows else ("1",)
                 unknowns = {"translation": 3, "rotation": 6, "acceleration": 9}[motion]
-                options["own_flows"] = OwnFlows(columns, sampling, self.steps, own, unknowns, model.reference_rows)
+                growth = bool(options.pop("growth", "x" in own))
+                options["own_flows"] = OwnFlows(
+                    columns, sampling, self.steps, own, unknowns, model.reference_rows, growth
+                )
                 tensors = self._own_tensors
         problem = Problem(self.columns, self.sampling, **options)
         stage = EstimateStage(self.device, problem, self.layout, self.view)

@@ -72,7 +72,7 @@ def test_predicted_standard_deviations_are_the_empirical_ones(
     """160 samples about 4 means know a standard deviation to 1 / sqrt(2 * 156) = 6 %, so .7 to 1.4 is five of these
     standard errors: that much more than chance is left to the approximations of the covariance. ρ is that of the
     gradient; of the image itself, which brightness is measured by, one more smoothing leaves nearly all, so that the
-    errors of brightness are underrated by up to the square root of ρ, here .75."""
+    errors of brightness are underrated by up to the square root of ρ, here .68."""
     names, found, predicted, _ = estimates(make_bench, model, estimator, light)
     empirical = np.sqrt(np.mean(np.var(found, axis=0, ddof=1), axis=0))
     ratio = np.sqrt(np.mean(predicted**2, axis=(0, 1))) / empirical

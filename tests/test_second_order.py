@@ -27,6 +27,7 @@ COMBINATIONS = [
     for brightness in ("temporal", "spatial", "camera")
     for terms in ("time", "space", "both")
     if row.time or (brightness != "temporal" and terms == "space")
+    if not row.ranges
 ]
 SINGLE = [("flow-quadratic", "spatial", "both"), ("affine-4d", "spatial", "time"), ("affine-5d", "camera", "both")]
 """Compared in single precision too."""

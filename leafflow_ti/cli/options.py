@@ -21,13 +21,17 @@ Model = Annotated[
     _text(
         "model",
         "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d|scene-flow|"
-        "affine-scene-flow",
+        "affine-scene-flow|range-flow",
         "What is estimated [auto: affine-scene-flow, depth without time, flow-affine for one camera].",
     ),
 ]
 Motion = Annotated[
     str | None,
     _text("motion", "auto|translation|rotation|acceleration", "Unknowns of the 3D motion [auto: rotation, if it can]."),
+]
+Deformation = Annotated[
+    str | None,
+    _text("deformation", "auto|none|growth", "Whether the surface may grow [auto: growth with affine-scene-flow]."),
 ]
 Rows = Annotated[
     str | None, _text("rows", "auto|(u|2d)[+b5][+as][+at]", "Flow parameters that enter the 3D fit [auto].")
@@ -37,6 +41,14 @@ Brightness = Annotated[
 ]
 BrightnessTerms = Annotated[
     str | None, _text("brightness-terms", "none|time|space|both", "Second-order terms of the brightness [none].")
+]
+Constraint = Annotated[
+    str | None, _text("constraint", "int|grad|intgrad|taylor", "Range flow: constraint on the intensity [taylor].")
+]
+Beta = Annotated[float | None, _text("beta", "WEIGHT", "Range flow: weight of intensity against range [1].")]
+Depth = Annotated[
+    str | None,
+    _text("depth", "OUT.zarr|STACK|PATTERN", "Range flow: range maps in mm, such as z_{t:03d}.tif [from the cameras]."),
 ]
 Estimator = Annotated[
     str | None, _text("estimator", "ols|tls|tls-equilibrated", "Estimator of the flow parameters [tls-equilibrated].")

@@ -134,7 +134,7 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
                 for m in ti.static(range(2)):
                     weight[2, m] -= past * weight[k, m]
             weight[2, 2] = 1
-        first = number[Number.WORLD_ROW]
+        first = number[Number.MOTION_FLOW] + 1  # behind the row of I
         for k in range(number[Number.WORLD_MAPS]):
             result = precise(0.0)
             variance = precise(0.0)
@@ -198,7 +198,7 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
                     variance = ws[base + (number[Region.BRIGHTNESS_VARIANCE] + j) * stride + i]
                     put(out, Output.BRIGHTNESS_SX + number[Number.CAMERA_AXIS + j], at, n_pixels, -ws[p], variance)
             for j in range(number[Number.BRIGHTNESS_ROWS]):
-                row = 2 * number[Number.OFFSETS] + j
+                row = number[Number.MOTION_FLOW] + j
                 p = parameter(base, row, stride, number)
                 plane = Output.BRIGHTNESS_T + number[Number.BRIGHTNESS_PLANES + j]
                 put(out, plane, at, n_pixels, -ws[p + i], ws[rows + tri(row, row) * stride])
@@ -213,10 +213,12 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
         """Write the planes of the motion."""
         n = number[Number.UNKNOWNS]
         for i in range(lanes):
-            for j in range(n):
-                q = base + (number[Region.MOTION] + j) * stride + i
-                cov = base + (number[Region.MOTION_COV] + j * n + j) * stride + i
-                put(out, Output.MOTION + j, pixel + i, n_pixels, ws[q], ws[cov])
+            for j in range(9):
+                place = number[Number.PLACE + j]
+                if place >= 0:
+                    q = base + (number[Region.MOTION] + j) * stride + i
+                    cov = base + (number[Region.MOTION_COV] + place * n + place) * stride + i
+                    put(out, Output.MOTION + j, pixel + i, n_pixels, ws[q], ws[cov])
             if n >= 3:
                 for axis in range(2):
                     for r in range(3):

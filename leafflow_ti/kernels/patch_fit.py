@@ -1,5 +1,8 @@
 """Motion of the surface patch: least squares of (N, Ω, A) from motion rows of one or of all cameras.
 
+With all cameras the patch may also grow in its plane, ``U = N + Ω × P + ε P``: the flow's derivatives along x and y
+cannot tell growth from approach, the flow of several cameras can.
+
 Schuchert 2010, Eqs. (5.8), (5.18), (5.23), (6.15) with the errata of the model contract: the time column uses
 ``∂X/∂t - N``, and preshifted data measure ``b a_s + nu0 a_x`` along a camera axis. The window's affine fit sees the
 mean of what it leaves out: on a plane the flow is quadratic in x, y, and its second-order part times the window's
@@ -21,6 +24,8 @@ START, CLEAR, FINISH, DIFFERENCES = 1, 2, 4, 8
 """What a launch does besides adding its rows: forget the motion, forget the sums (both before), solve (after), find the
 covariances of difference quotients (in every launch of a fit, or in none)."""
 RANGE_CODE = 6
+GROWTH = 9
+"""Place of ε among the components (N, Ω, A, ε) of the motion."""
 
 
 @functools.cache
@@ -28,7 +33,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
     """Formulas of one patch, for one pixel: ``pixel_ray``, ``surface``, ``motion_row`` and ``range_row``."""
     precise = spec.precise
     vec3 = ti.types.vector(3, precise)
-    vec9 = ti.types.vector(MAX_UNKNOWNS, precise)
+    vec_q = ti.types.vector(MAX_UNKNOWNS, precise)
 
     @ti.func
     def pixel_ray(pixel: ti.i32, number: ti.template(), value: ti.template()):
@@ -50,14 +55,14 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def bare_row(k: ti.i32, code: ti.i32, ray: ti.template(), f: precise, s: ti.template(), N: ti.template()):
-        """Coefficients of (N, Ω, A) in ``a_k,m`` (5.18); codes 0 = the motion itself, 1.. = x, y, sx, sy, t."""
+        """Coefficients of (N, Ω, A, ε) in ``a_k,m`` (5.18); codes 0 = the motion itself, 1.. = x, y, sx, sy, t."""
         Z0, ZX, ZY, c = s[0], s[1], s[2], s[3]
         x, y = ray[0], ray[1]
         nu = -f / Z0
         e = vec3(1, 0, -x)
         if k == 1:
             e = vec3(0, 1, -y)
-        row = vec9(0)
+        row = vec_q(0)
         if code == 0:
             for j in ti.static(range(3)):
                 row[j] = -nu * e[j]
@@ -86,6 +91,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
                 row[3 + j] = -nu * turn[j]
                 if code == 5:
                     row[6 + j] = -nu * e[j]
+            row[GROWTH] = -nu * delta.dot(e)
             if code == k + 1:
                 row[2] += nu / f
         return row
@@ -97,7 +103,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         """The row as the window and the preshifted data measure it, per camera step along s."""
         f = value[Value.F]
         along_s = code == 3 or code == 4
-        row = vec9(0)
+        row = vec_q(0)
         for part in range(ti.select(along_s, 2, 1)):
             factor = precise(1.0)
             if along_s:
@@ -105,18 +111,19 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
             row += factor * bare_row(k, ti.select(part == 0, code, code - 2), ray, f, s, N)
         if code == 0:
             # Half the second derivative of u_k along its own axis: -T_Z d(1/Z) + (Ω × e_Z)_k / f, where T = N - Ω × X0
-            # is the velocity that the patch's rigid motion has at the camera; along the other axis it vanishes.
+            # - ε X0 is the velocity that the patch's motion has at the camera; along the other axis it vanishes.
             moment = value[Value.SECOND_MOMENT + k]
             bend = moment * s[1 + k] / (f * s[0] * s[3])
             row[2] += bend
             row[3] -= bend * s[0] * ray[1] + ti.select(k == 1, moment / f, precise(0.0))
             row[4] += bend * s[0] * ray[0] + ti.select(k == 0, moment / f, precise(0.0))
+            row[GROWTH] -= bend * s[0]
         return row
 
     @ti.func
     def range_row(f: precise, s: ti.template()):
         """Coefficients of the range constraint ``b_t`` (5.23)."""
-        row = vec9(0)
+        row = vec_q(0)
         scale = f / (s[0] * s[0] * s[3])
         row[0] = -scale * s[1]
         row[1] = -scale * s[2]
@@ -218,7 +225,9 @@ def patch_fit_kernel(spec: KernelSpec):
                     row = any_row(r, ray, s, N, number, value)
                     if variant == 0:
                         for j in ti.static(range(MAX_UNKNOWNS)):
-                            ws[target + (r * MAX_UNKNOWNS + j) * stride + i] = row[j]
+                            place = number[Number.PLACE + j]
+                            if place >= 0:
+                                ws[target + (r * MAX_UNKNOWNS + place) * stride + i] = row[j]
                         ws[left_out + r * stride + i] = equation_error(r, row, motion, s, number, value)
                     else:
                         ws[derivative + (r * terms + term) * stride + i] -= row.dot(motion) / (2 * h)
@@ -242,7 +251,7 @@ def patch_fit_kernel(spec: KernelSpec):
     def row_spread(
         base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
     ):
-        """OWN: noise of the rows; FACTOR, for the weights: that, the geometry's noise in them, and what they leave out."""
+        """OWN: noise of the rows. FACTOR, for the weights: that, the geometry's noise in them, what they leave out."""
         terms, offsets = number[Number.TERMS], number[Number.OFFSETS]
         cov_t = base + number[Region.COV_T] * stride
         cov_g = base + number[Region.GEOMETRY_COV] * stride
@@ -416,12 +425,15 @@ def patch_fit_kernel(spec: KernelSpec):
         """Motion from the sums, its covariance and, with three variants, those of its difference quotients."""
         n, terms = number[Number.UNKNOWNS], number[Number.TERMS]
         normal = base + number[Region.MOTION_WORK] * stride
-        q = base + number[Region.MOTION] * stride
-        small.copy(ws, base + number[Region.NORMAL_RHS] * stride, q, n, stride)
+        q = base + number[Region.NORMAL_RHS] * stride
         for r in range(n):
             small.copy(ws, base + (number[Region.NORMAL] + r * n) * stride, normal + tri(r, 0) * stride, r + 1, stride)
         small.cholesky(ws, normal, n, -1, stride)
         small.solve(ws, normal, q, n, 1, stride)
+        for j in range(MAX_UNKNOWNS):
+            if number[Number.PLACE + j] >= 0:
+                place = base + (number[Region.MOTION] + j) * stride
+                small.copy(ws, q + number[Number.PLACE + j] * stride, place, 1, stride)
         count = terms + number[Number.CORRELATED]
         for variant in range(variants):
             cov = base + number[Region.MOTION_COV] * stride

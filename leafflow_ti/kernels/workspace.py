@@ -16,7 +16,7 @@ from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
 BLOCK = 4
 """Vectors that the block inverse iteration carries: the solutions and at least one guard."""
-MAX_UNKNOWNS = 9
+MAX_UNKNOWNS = 10
 MAX_ROWS = 16
 MAX_COLUMNS = 32
 MAX_SQUARES = 8
@@ -24,7 +24,7 @@ MAX_SQUARES = 8
 
 class Region(IntEnum):
     """Regions; shapes with N columns, k solutions, F = N - k, S and T rows of a camera solution
-    and of the motion solution, G geometry terms, M equations of the motion fit."""
+    and of the motion solution, G geometry terms, M equations and Q unknowns of the motion fit."""
 
     TENSOR = 0  # packed [N]: scaled structure tensor, then its Cholesky factor
     VECTORS = auto()  # [N, BLOCK]: iterated vectors
@@ -54,20 +54,20 @@ class Region(IntEnum):
     GEOMETRY_COV = auto()  # [G, G]
     GEOMETRY_CROSS = auto()  # [G, T]
     GEOMETRY_WORK = auto()  # [S, G]
-    MOTION = auto()  # [9]
-    MOTION_COV = auto()  # [9, 9]
-    DIFFERENCE_COV = auto()  # [2, 9, 9]: of difference quotients of the motion along x and y
-    DESIGN = auto()  # [M, 9]
+    MOTION = auto()  # [Q]
+    MOTION_COV = auto()  # [Q, Q]
+    DIFFERENCE_COV = auto()  # [2, Q, Q]: of difference quotients of the motion along x and y
+    DESIGN = auto()  # [M, Q]
     VALUE = auto()  # [M]
     LEFT_OUT = auto()  # [M]: standard size of what each equation leaves out
-    WEIGHTED = auto()  # [M, 9]: weights times design
+    WEIGHTED = auto()  # [M, Q]: weights times design
     OWN = auto()  # packed [M]: covariance of the rows without what they owe to the geometry
     FACTOR = auto()  # packed [M]: of the weights' inverse
     DERIVATIVE = auto()  # [M, G]
-    MOTION_WORK = auto()  # [M, 9], packed [9]
-    NORMAL = auto()  # [9, 9]; from here on: sums over the sets of rows of the motion fit
-    NORMAL_RHS = auto()  # [9]
-    NORMAL_SPREAD = auto()  # [3, 9, 9]: for the motion and its difference quotients along x and y, as the next two
+    MOTION_WORK = auto()  # [M, Q], packed [Q]
+    NORMAL = auto()  # [Q, Q]; from here on: sums over the sets of rows of the motion fit
+    NORMAL_RHS = auto()  # [Q]
+    NORMAL_SPREAD = auto()  # [3, Q, Q]: for the motion and its difference quotients along x and y, as the next two
     LEFT = auto()  # [3, G + F, 9]: by the errors of the geometry, of the reference's normal equations
     RIGHT = auto()  # [3, G + F, 9]: what is correlated with them
     REFERENCE_VARIANCE = auto()  # [1]
@@ -168,7 +168,8 @@ class Number(IntEnum):
     TERMS = auto()  # G: geometry terms (1, x, y, t), 0 without a grid
     OFFSETS = auto()  # number of motion offsets
     ROWS_S = auto()  # rows of a camera solution: 2 G, and one for brightness if the model has it
-    ROWS_T = auto()  # rows of the motion solution: 2 OFFSETS + BRIGHTNESS_ROWS
+    ROWS_T = auto()  # rows of the motion solution: MOTION_FLOW + BRIGHTNESS_ROWS
+    MOTION_FLOW = auto()  # its flow rows: 2 OFFSETS; of range flow 3
     USE_RANGE = auto()
     UNKNOWNS = auto()  # of the motion fit; 0 without one
     WEIGHTED = auto()  # weighted least squares, else plain
@@ -176,7 +177,6 @@ class Number(IntEnum):
     CORRELATED = auto()  # columns of the reference model whose noise other cameras share; 0 without them
     BRIGHTNESS_COLUMN = auto()  # column of I, or -1
     BRIGHTNESS_ROWS = auto()  # brightness rows of the motion solution, behind its flow rows
-    WORLD_ROW = auto()  # the first of its rows of IΔx, IΔy, IΔt
     WORLD_MAPS = auto()  # brightness in world coordinates: 2 along X, Y; 3 with the trend; 0 without slopes
     CENTRE_TERMS = auto()  # what centred squares add to the value at the window's centre
     NOISE_TERMS = auto()  # terms of each solution's noise beyond the ratios
@@ -198,7 +198,8 @@ class Number(IntEnum):
     CENTRE = BRIGHTNESS_PLANES + 4  # MAX_SQUARES x 2: column of the constant, column of the square
     MOVE = CENTRE + 2 * MAX_SQUARES  # 2 x 2: columns of the flow's derivatives along x, y
     PARTNER = MOVE + 4  # MAX_COLUMNS: column of an own flow for each column of the reference model, or -1
-    LOWER = PARTNER + MAX_COLUMNS  # N (N + 1) / 2: plane of each element of the lower triangle
+    PLACE = PARTNER + MAX_COLUMNS  # MAX_UNKNOWNS: where each component of the motion stands among the unknowns, or -1
+    LOWER = PLACE + MAX_UNKNOWNS  # N (N + 1) / 2: plane of each element of the lower triangle
     # Behind them NOISE_TERMS x 2: element of the lower triangle, plane of J.
 
 
@@ -223,7 +224,8 @@ class Value(IntEnum):
     ROUGHEST = auto()  # share of the gradient's energy that one more smoothing leaves, below which it is noise
     MAX_RESIDUAL = auto()  # px, for status incoherent
     MAX_SHIFT = auto()  # px per step or frame, likewise
-    GAP = auto()  # convergence: residual per gap
+    MOTION_SCALE = auto()  # 2: mm per px of range flow's U', V', and of W
+    GAP = MOTION_SCALE + 2  # convergence: residual per gap
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.models import AXES, Column, ColumnSet, TensorLayout
+from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import (
     NoiseTerm,
@@ -19,7 +19,6 @@ from leafflow_ti.sampling import (
     column_noise,
     cross_noise,
     difference_variance,
-    noise_gain,
     noise_ratio,
     shared_noise,
     white_smoothness,
@@ -60,7 +59,8 @@ MAX_RESIDUAL_PX = 0.5
 class OwnFlows:
     """The flows of single cameras in the motion fit (6.15): their data vector, and where the cameras stand.
 
-    ``steps``: (x, y) steps of each camera from the reference. ``offsets``: of their rows. ``unknowns`` of the fit.
+    ``steps``: (x, y) steps of each camera from the reference. ``offsets``: of their rows. ``unknowns``: components of
+    (N, Ω, A) in the fit; ``growth``: and the rate at which the patch grows in its plane.
     ``reference_rows``: the rows of the reference model take part, too.
     """
 
@@ -70,6 +70,7 @@ class OwnFlows:
     offsets: tuple[str, ...]
     unknowns: int
     reference_rows: bool
+    growth: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,8 @@ class Problem:
     """What is estimated: columns, geometry terms, motion rows; independent of band and device.
 
     ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``fitted``: unknowns of the motion fit to the
-    reference's rows (0: none), from which a fit with ``own_flows`` starts.
+    reference's rows (0: none), from which a fit with ``own_flows`` starts. ``range_scale``: of range flow, mm per px of
+    (U', V') and of W.
     """
 
     columns: ColumnSet
@@ -91,6 +93,7 @@ class Problem:
     own_flows: OwnFlows | None = None
     passes: int = 3
     iterations: int = 4
+    range_scale: tuple[float, float] | None = None
 
     @property
     def unknowns(self) -> int:
@@ -205,7 +208,8 @@ class EstimateStage:
         if own:
             # The same rows among all unknowns.
             self._final = _Tables(self.reference.number.copy(), self.reference.value)
-            self._set_numbers(self._final.number, UNKNOWNS=own.unknowns, CORRELATED=columns.n_flow)
+            self._set_numbers(self._final.number, CORRELATED=columns.n_flow)
+            self._set_unknowns(self._final.number, own.unknowns, own.growth)
             self._own = self._own_tables(own)
             self._all_tables += [self._final, *self._own]
         self.set_view(view)
@@ -231,6 +235,8 @@ class EstimateStage:
             return [i for i in found if i is not None]
 
         motion = both("x", problem.offsets, problem.brightness) if "t" in columns.solutions else []
+        if problem.range_scale is not None:
+            motion.insert(2, 2)  # the column of W, behind those of U' and V'
         camera = [both("x" if a == "sx" else "y", problem.terms, ["1"]) for a in problem.camera_axes]
         return SimpleNamespace(motion=motion, camera=camera)
 
@@ -240,6 +246,17 @@ class EstimateStage:
 
         for name, entry in entries.items():
             number[Number[name]] = entry
+
+    @staticmethod
+    def _set_unknowns(number: NDArray[np.int32], n: int, growth: bool = False) -> None:
+        """The unknowns are the first ``n`` components of (N, Ω, A), and the growth behind them."""
+        from leafflow_ti.kernels.patch_fit import GROWTH
+        from leafflow_ti.kernels.workspace import Number
+
+        number[Number.UNKNOWNS] = n + growth
+        number[Number.PLACE : Number.PLACE + n] = range(n)
+        if growth:
+            number[Number.PLACE + GROWTH] = n
 
     def _tables(
         self, columns: ColumnSet, sampling: Sampling, layout: TensorLayout, offsets: Sequence[str], rows: Sequence[int]
@@ -260,12 +277,13 @@ class EstimateStage:
             OFFSETS=len(offsets), ROWS_T=len(rows), ROWS_S=0, USE_RANGE=0, UNKNOWNS=0, WEIGHTED=problem.weighted,
             BRIGHTNESS_COLUMN=-1, BRIGHTNESS_ROWS=0, WORLD_MAPS=0, RANGE_TERM=-1, CAMERA_SOLUTIONS=0, CROSS_TERMS=0,
             OWN_FLOW=0, CORRELATED=0, EXTRA=len(layout.entries), CENTRE_TERMS=len(columns.at_centre),
-            NOISE_TERMS=len(terms),
+            NOISE_TERMS=len(terms), MOTION_FLOW=len(rows),
         )  # fmt: skip
         for j, (constant, square, factor) in enumerate(columns.at_centre):
             number[Number.CENTRE + 2 * j : Number.CENTRE + 2 * j + 2] = constant, square
             value[Value.CENTRE + j] = factor
-        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = [columns.columns.index(Column.of(c)) for c in ("x", "y")]
+        flow_rows = [i for c in ("x", "y") if (i := columns.index(c)) is not None]
+        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = flow_rows
         for i, o in enumerate(offsets):
             number[Number.OFFSET_CODES + i] = 0 if o == "1" else 1 + AXES.index(o)
         number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows)] = rows
@@ -275,7 +293,7 @@ class EstimateStage:
         value[Value.RIDGE], value[Value.GAP], value[Value.STEP_SIZE] = (t[precision] for t in (RIDGE, GAP, STEP_SIZE))
         value[Value.SCALE : Value.SCALE + columns.n] = noise**-0.5
         value[Value.NOISE : Value.NOISE + columns.n] = noise
-        value[Value.GAIN] = noise_gain(sampling, "x")
+        value[Value.GAIN] = noise[flow_rows[0]]
         value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
         value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
@@ -299,11 +317,13 @@ class EstimateStage:
         brightness = columns.index("i")
         self._set_numbers(
             number, ROWS_S=len(rows.camera[0]) if rows.camera else 0, USE_RANGE=problem.use_range,
-            UNKNOWNS=problem.fitted, BRIGHTNESS_COLUMN=-1 if brightness is None else brightness,
-            BRIGHTNESS_ROWS=len(problem.brightness), WORLD_ROW=2 * len(problem.offsets) + 1,
+            BRIGHTNESS_COLUMN=-1 if brightness is None else brightness,
+            BRIGHTNESS_ROWS=len(problem.brightness), MOTION_FLOW=len(rows.motion) - len(problem.brightness),
             WORLD_MAPS=len(problem.world_brightness), CAMERA_SOLUTIONS=len(problem.camera_axes),
             RANGE_TERM=problem.terms.index("t") if "t" in problem.terms else -1,
         )  # fmt: skip
+        self._set_unknowns(number, problem.fitted)
+        value[Value.MOTION_SCALE : Value.MOTION_SCALE + 2] = problem.range_scale or (0.0, 0.0)
         planes = [Output[BRIGHTNESS_MAPS[o].upper()] - Output.BRIGHTNESS_T for o in problem.brightness]
         number[Number.BRIGHTNESS_PLANES : Number.BRIGHTNESS_PLANES + len(planes)] = planes
         for k, axis in enumerate(problem.camera_axes):
@@ -328,7 +348,8 @@ class EstimateStage:
             own.columns, own.sampling, TensorLayout.of(own.columns), own.offsets, [i for i in rows if i is not None]
         )
         correlated = columns.n_flow if own.reference_rows else 0
-        self._set_numbers(common.number, OWN_FLOW=1, UNKNOWNS=own.unknowns, CORRELATED=correlated)
+        self._set_numbers(common.number, OWN_FLOW=1, CORRELATED=correlated)
+        self._set_unknowns(common.number, own.unknowns, own.growth)
         moves = [own.columns.index(c, o) for c in ("x", "y") for o in ("x", "y")]
         common.number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
         found = []
@@ -385,6 +406,7 @@ class EstimateStage:
         from leafflow_ti.kernels.covariance import covariance_kernels
         from leafflow_ti.kernels.maps import Output, maps_kernels
         from leafflow_ti.kernels.patch_fit import CLEAR, DIFFERENCES, FINISH, START, patch_fit_kernel
+        from leafflow_ti.kernels.range_motion import range_motion_kernel
 
         device, view, problem, own = self.device, self.view, self.problem, self.problem.own_flows
         lanes = device.dense.lanes
@@ -426,7 +448,9 @@ class EstimateStage:
                 launch(covariance.add_camera, which=camera)
             if problem.camera_axes:
                 launch(covariance.geometry)
-            if problem.fitted:
+            if problem.range_scale is not None:
+                launch(range_motion_kernel(device.dense))
+            elif problem.fitted:
                 fit = patch_fit_kernel(device.dense)
                 for i in range(problem.passes):
                     last = i == problem.passes - 1 and not own

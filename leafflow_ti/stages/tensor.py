@@ -8,6 +8,7 @@ and x. Nothing is computed twice when the window moves on by a frame.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from itertools import product
@@ -24,6 +25,8 @@ from leafflow_ti.stages.planes import Filtering, Terms, round_up
 EXTRA_PLANES = 4
 """Behind the tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
 OUTPUT_PLANES = 61
+FACTOR_PLANES = 4
+"""Planes that derived channels may be multiplied by."""
 _CAMERA = ("sy", "sx")
 _PASSES = ("t", "sy", "sx", "y", "x")
 _MASS, _ENERGY, _SMOOTH, _LEVEL = ((name, (0, 0)) for name in ("mass", "energy", "smooth", "level"))
@@ -63,10 +66,10 @@ class Band:
 
 def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int) -> int:
     """Memory of the arrays of one band, from raw frames to output maps."""
-    cameras = (2 * sampling.sy.radius + 1) * (2 * sampling.sx.radius + 1)
+    cameras = math.prod(_images(columns, sampling))
     taps = 2 * sampling.t.filter_radius + 1
     channels = len(columns.channels)
-    samples = sampling.sx.size * sampling.sy.size
+    samples = cameras if columns.derived else sampling.sx.size * sampling.sy.size
     s, t = (AXES.index("sx"), AXES.index("sy")), AXES.index("t")
     maps = {(m.channels, m.exponents[s[0]], m.exponents[s[1]]) for m in layout.moments}
     sums = {(m.channels, m.exponents[s[0]], m.exponents[s[1]], m.exponents[t]) for m in layout.moments}
@@ -77,6 +80,7 @@ def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, ban
         taps * cameras
         + 2 * scratch
         + samples * channels
+        + (channels + FACTOR_PLANES if columns.derived else 0)
         + extra
         + sampling.t.size * (len(maps) + extra)
         + len(sums)
@@ -89,17 +93,35 @@ def band_bytes(columns: ColumnSet, layout: TensorLayout, sampling: Sampling, ban
     )
 
 
+def _images(columns: ColumnSet, sampling: Sampling) -> tuple[int, int]:
+    """Images of one frame: rows and columns of cameras, or one row of a stack."""
+    if columns.derived:
+        return (1, 1 + max(d.image for d in columns.derived.values()))
+    return (2 * sampling.sy.radius + 1, 2 * sampling.sx.radius + 1)
+
+
+def eroded(valid: NDArray[np.bool_], ry: int, rx: int) -> NDArray[np.bool_]:
+    """Where all pixels within (ry, rx) are valid; without the outermost ry rows and rx columns."""
+    rows, cols = valid.shape[0] - 2 * ry, valid.shape[1] - 2 * rx
+    inside = np.ones((rows, cols), bool)
+    for dy, dx in product(range(2 * ry + 1), range(2 * rx + 1)):
+        inside &= valid[dy : dy + rows, dx : dx + cols]
+    return inside
+
+
 class TensorStage:
     """Turns a stream of frames of one band into structure tensors.
 
     ``push`` takes one frame's block [n_sy, n_sx, in_rows, in_cols] (preshifted) and its validity; once the window
     is full it returns the packed tensor [n_entries + EXTRA_PLANES, rows, pitch] as a flat device array, valid until
-    the next call.
+    the next call. For ``derived`` columns the block is a stack of images [1, n_images, ...] with its factor planes.
     """
 
     def __init__(self, device: Device, columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band):
         self.device, self.band, self.sampling = device, band, sampling
-        self.cameras = (2 * sampling.sy.radius + 1, 2 * sampling.sx.radius + 1)
+        self.columns = columns
+        self.cameras = _images(columns, sampling)
+        self.reference = (0, 0) if columns.derived else (self.cameras[0] // 2, self.cameras[1] // 2)
         self.pitch = round_up(band.in_cols, 64)
         self.out_pitch = round_up(band.cols, 64)
         self.n_taps = 2 * sampling.t.filter_radius + 1
@@ -117,6 +139,7 @@ class TensorStage:
         self._reference: deque[NDArray[Any]] = deque(maxlen=self.n_taps)
         self._pushed = 0
         self._n_maps = 0
+        self._factors: deque[NDArray[Any]] = deque(maxlen=self.n_taps)
 
     @property
     def latency(self) -> int:
@@ -125,7 +148,8 @@ class TensorStage:
 
     def _plan_filters(self, columns: ColumnSet) -> None:
         """Passes along t, sy, sx, y, x; a plane is known by its sample and the axis it was differentiated along."""
-        wanted = {None if c == "i" else c for c in columns.channels}
+        axes = [columns.derived[c].axis if columns.derived else c for c in columns.channels]
+        wanted = {None if a == "i" else a for a in axes if a != "1"}
         size = self.band.in_rows * self.pitch
         samples = tuple(product(range(self.n_taps), range(self.cameras[0]), range(self.cameras[1])))
         planes: dict[Any, int] = {(*s, None): i * size for i, s in enumerate(samples)}
@@ -155,6 +179,7 @@ class TensorStage:
         largest = max(f.size for phases in self._passes for f in phases)
         self._scratch = [self.device.empty(largest + self._slack) for _ in range(2)]
         self._plan_smoothness()
+        self._plan_derived()
 
     def _axis_pass(self, axis: str, planes: dict[Any, int], differentiated: set[str | None]) -> dict[Any, Any]:
         """Terms of every plane that one pass makes."""
@@ -181,7 +206,7 @@ class TensorStage:
 
         The smoothed planes are displaced by the filter radius: their window sums start that much earlier.
         """
-        centre = (self.n_taps // 2, self.cameras[0] // 2, self.cameras[1] // 2)
+        centre = (self.n_taps // 2, *self.reference)
         self._gradient = [self._channels[(*centre, a)] for a in ("x", "y")]
 
         def smooth(planes: list[int], axis: str, step: int) -> Filtering:
@@ -192,13 +217,38 @@ class TensorStage:
             return Filtering(self.device, outputs, self.map_rows, self.pitch, self.pitch)
 
         self._smoothing = (smooth(self._gradient, "y", self.pitch), smooth([0, 1], "x", 1))
-        n = len(self._channels)
-        self._sources = self.device.array(np.ones((n + 4) * self._plane_size + self._slack))
+        n = len(self._channels) + 4 + (len(self.columns.derived) + FACTOR_PLANES if self.columns.derived else 0)
+        self._sources = self.device.array(np.ones(n * self._plane_size + self._slack))
+
+    def _plan_derived(self) -> None:
+        """Derived channels lie behind all that, then the factor planes: a channel is a product of two planes."""
+        n, derived = len(self._channels), self.columns.derived
+        if not derived:
+            return
+        one = n + 2
+        self._first_factor = n + 4 + len(derived)
+        first, second = [], []
+        for d in derived.values():
+            where = (self.n_taps // 2, 0, d.image)
+            first.append(one if d.axis == "1" else self._channels[(*where, None if d.axis == "i" else d.axis)])
+            second.append(one if d.factor is None else self._first_factor + d.factor)
+        self._derived = {name: n + 4 + k for k, name in enumerate(derived)}
+        self._derived_tables = (
+            self.device.array(range(len(derived) + 1), "int"), self.device.array(first, "int"),
+            self.device.array(second, "int"), self.device.array(np.ones(len(derived))),
+            self.device.array(np.ones(self._plane_size)),
+        )  # fmt: skip
+
+    def _plane(self, channel: str, tap: int, sy: int, sx: int) -> int:
+        """Plane of a channel of one camera."""
+        if self.columns.derived:
+            return self._derived[channel]
+        return self._channels[tap, sy, sx, None if channel == "i" else channel]
 
     def _plan_products(self, layout: TensorLayout) -> None:
         """This frame's maps: products summed over camera samples, for each power of the camera offsets."""
         sampling = self.sampling
-        centre = (self.cameras[0] // 2, self.cameras[1] // 2)
+        centre = self.reference
         outputs: dict[Any, list[tuple[tuple[int, int], float]]] = {}
         tap = self.n_taps // 2
         for moment in layout.moments:
@@ -207,12 +257,12 @@ class TensorStage:
             if key in outputs:
                 continue
             weights = [sampling.axis(a).window(p) for a, p in zip(_CAMERA, powers, strict=True)]
-            a, b = (None if c == "i" else c for c in moment.channels)
+            a, b = moment.channels
             terms = []
             for (iy, wy), (ix, wx) in product(enumerate(weights[0]), enumerate(weights[1])):
                 where = (tap, centre[0] + iy - len(weights[0]) // 2, centre[1] + ix - len(weights[1]) // 2)
                 if wy * wx:
-                    terms.append(((self._channels[(*where, a)], self._channels[(*where, b)]), float(wy * wx)))
+                    terms.append(((self._plane(a, *where), self._plane(b, *where)), float(wy * wx)))
             outputs[key] = terms
         n = len(self._channels)
         outputs[_ENERGY] = [((g, g), 1.0) for g in self._gradient]
@@ -298,16 +348,19 @@ class TensorStage:
         self._tall = self.device.empty(self._along_y.size + self._slack)
         self.tensor = self.device.empty(self._along_x.size + self._slack)
 
-    def push(self, block: NDArray[Any], valid: NDArray[np.bool_]) -> Any | None:
+    def push(self, block: NDArray[Any], valid: NDArray[np.bool_], factors: NDArray[Any] | None = None) -> Any | None:
         """Add the next frame; the tensor of the frame ``latency`` before it, or None while the window fills.
 
-        ``valid`` [in_rows, in_cols]: pixels at which every camera has a finite grey value inside its image.
+        ``valid`` [in_rows, in_cols]: pixels at which every camera has a finite grey value inside its image;
+        ``factors`` [FACTOR_PLANES, in_rows, in_cols]: what derived channels are multiplied by.
         """
         frame = np.zeros((*self.cameras, self.band.in_rows, self.pitch), self.device.real("storage"))
         frame[..., : self.band.in_cols] = block
         self.device.write(self._raw, self._pushed % self.n_taps * self._frame_size, frame)
         self._valid.append(valid)
-        self._reference.append(frame[self.cameras[0] // 2, self.cameras[1] // 2].copy())
+        self._reference.append(frame[self.reference].copy())
+        if factors is not None:
+            self._factors.append(np.asarray(factors, frame.dtype))
         self._pushed += 1
         if self._pushed < self.n_taps:
             return None
@@ -331,7 +384,10 @@ class TensorStage:
         along_y, along_x = self._smoothing
         along_y(self._sources, self._scratch[0])
         along_x(self._scratch[0], self._sources, len(self._channels) * self._plane_size)
-        device.write(self._sources, (len(self._channels) + 3) * self._plane_size, self._grey_values())
+        grey = self._reference[self.n_taps // 2]
+        device.write(self._sources, (len(self._channels) + 3) * self._plane_size, self._inner(grey))
+        if self.columns.derived:
+            self._make_derived()
         slot = self._n_maps % self.sampling.t.size
         sum_products_kernel(device.planes)(
             len(self._map_index), self._plane_size, slot * self._slot_size,
@@ -340,20 +396,27 @@ class TensorStage:
         )  # fmt: skip
         self._n_maps += 1
 
-    def _grey_values(self) -> NDArray[Any]:
-        """The reference camera's image where the channels are: [map_rows, pitch]."""
+    def _make_derived(self) -> None:
+        from leafflow_ti.kernels.planes import sum_products_kernel
+
+        device, size, n = self.device, self._plane_size, len(self._derived)
+        for k, plane in enumerate(self._factors[self.n_taps // 2]):
+            padded = np.pad(plane, ((0, 0), (0, self.pitch - plane.shape[1])))
+            device.write(self._sources, (self._first_factor + k) * size, self._inner(padded))
+        sum_products_kernel(device.planes)(
+            n, size, (self._first_factor - n) * size, device.tasks(size // device.planes.lanes),
+            *self._derived_tables, self._sources, self._sources,
+        )  # fmt: skip
+
+    def _inner(self, image: NDArray[Any]) -> NDArray[Any]:
+        """A plane of the block [in_rows, pitch] where the channels are: [map_rows, pitch]."""
         ry, rx = self.sampling.y.filter_radius, self.sampling.x.filter_radius
-        image = self._reference[self.n_taps // 2][ry : ry + self.map_rows, rx:]
-        return np.pad(image, ((0, 0), (0, rx)))
+        return np.pad(image[ry : ry + self.map_rows, rx:], ((0, 0), (0, rx)))
 
     def _mask(self) -> NDArray[Any]:
         """Where the filters see valid pixels only: [map_rows, pitch]."""
         valid = np.logical_and.reduce(list(self._valid))
         ry, rx = self.sampling.y.filter_radius, self.sampling.x.filter_radius
         mask = np.zeros((self.map_rows, self.pitch), self.device.real("storage"))
-        rows, cols = self.map_rows, self.band.in_cols - 2 * rx
-        inside = np.ones((rows, cols), bool)
-        for dy, dx in product(range(2 * ry + 1), range(2 * rx + 1)):
-            inside &= valid[dy : dy + rows, dx : dx + cols]
-        mask[:, :cols] = inside
+        mask[:, : self.band.in_cols - 2 * rx] = eroded(valid, ry, rx)
         return mask

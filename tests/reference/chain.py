@@ -71,7 +71,7 @@ def shares(columns: ColumnSet):
     flow = columns.columns[: columns.n_flow]
     T = np.eye(columns.n_flow)
     for i, column in enumerate(flow):
-        for term in column.terms[1:]:
+        for term in column.terms[1:] if max(column.terms[0].exponents) > 1 else ():
             T[i, [c.terms[0] for c in flow].index(replace(term, factor=1.0))] = term.factor
     return T
 
@@ -186,7 +186,7 @@ def surface(x0, y0, f, nu, b1=0.0, b2=0.0):
 
 
 def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 0.0)):
-    """Design [rows, 9] by (N, Ω, A) of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
+    """Design [rows, 10] by (N, Ω, A, ε) of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
 
     Rows run over the directions, then the offsets. The s-offsets are per camera step at the preshifted pixel.
     ``moments`` (x, y): second moments of the window, of which the flow's own rows see the second derivatives.
@@ -214,7 +214,7 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 
     unit = np.eye(3)
 
     def row(k, o):
-        r = np.zeros(9)
+        r = np.zeros(10)
         if o == "1":
             r[:3] = -nu * e[k]
             return r + moments[k] / 2 * second_derivative(x0, y0, f, (Z0, ZX, ZY), k)
@@ -223,6 +223,7 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 
             r[2] += nu / f
         for j in range(3):
             r[3 + j] = -nu * e[k] @ np.cross(unit[j], delta[o])
+        r[9] = -nu * e[k] @ delta[o]
         if o == "t":
             r[6:9] = -nu * e[k]
         return r
@@ -238,7 +239,7 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 
 
 
 def second_derivative(x0, y0, f, plane, k):
-    """Coefficients [9] of (N, Ω, A) in ∂²u_k/∂x_k² on the plane (Z0, ZX, ZY) seen at (x0, y0), by exact differences.
+    """Coefficients [10] of (N, Ω, A, ε) of ∂²u_k/∂x_k² on the plane (Z0, ZX, ZY) at (x0, y0), by exact differences.
 
     The flow of a rigidly moving plane is quadratic in x and y, so second differences of any width are exact.
     """
@@ -249,17 +250,17 @@ def second_derivative(x0, y0, f, plane, k):
         x, y = (x0 + d, y0) if k == 0 else (x0, y0 + d)
         ray = np.array([x / f, y / f, 1.0])
         X = (Z0 - ZX * X0[0] - ZY * X0[1]) / (1 - ZX * ray[0] - ZY * ray[1]) * ray
-        U = q[:3] + np.cross(q[3:6], X - X0)
+        U = q[:3] + np.cross(q[3:6], X - X0) + q[9] * (X - X0)
         return f * (U[k] - ray[k] * U[2]) / X[2]
 
     h = 0.05 * f
-    return np.array([(flow(h, q) - 2 * flow(0, q) + flow(-h, q)) / h**2 for q in np.eye(9)])
+    return np.array([(flow(h, q) - 2 * flow(0, q) + flow(-h, q)) / h**2 for q in np.eye(10)])
 
 
 def range_row(x0, y0, f, geometry):
-    """Design [9] of the range constraint for b_t (5.23)."""
+    """Design [10] of the range constraint for b_t (5.23)."""
     Z0, ZX, ZY, c = surface(x0, y0, f, *geometry)
-    r = np.zeros(9)
+    r = np.zeros(10)
     r[:3] = f / (Z0**2 * c) * np.array([-ZX, -ZY, 1.0])
     return r
 
@@ -383,13 +384,13 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         ) * (rho_own * np.sqrt(variance[k] * s2[0]))
         return found, shared @ E.T
 
-    def fit(sets, n, common):
-        """Unknowns [n] and covariances; ``common``: covariance of the first set's rows with each other set's."""
+    def fit(sets, which, common):
+        """Components ``which`` of (N, Ω, A, ε), covariances; ``common``: of the first set's rows with each other's."""
         weights = []
         for _, _, C, D, _, left_out, _ in sets:
             weights.append(np.linalg.inv(C + D @ cov_g @ D.T + left_out) if problem.weighted else np.eye(len(C)))
-        normal = sum(A[:, :n].T @ W @ A[:, :n] for (A, *_), W in zip(sets, weights, strict=True))
-        gains = [np.linalg.solve(normal, A[:, :n].T @ W) for (A, *_), W in zip(sets, weights, strict=True)]
+        normal = sum(A[:, which].T @ W @ A[:, which] for (A, *_), W in zip(sets, weights, strict=True))
+        gains = [np.linalg.solve(normal, A[:, which].T @ W) for (A, *_), W in zip(sets, weights, strict=True)]
         solution = sum(G @ s[1] for G, s in zip(gains, sets, strict=True))
         spreads = [spread_of(gains, sets, common)]
         for axis in ("x", "y"):
@@ -411,10 +412,10 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
             spread += part + part.T
         return spread
 
-    q = np.zeros(9)
+    q = np.zeros(10)
     for _ in range(problem.passes):
         first, rows = reference_rows(q)
-        q[: problem.fitted], spreads = fit([first], problem.fitted, [])
+        q[: problem.fitted], spreads = fit([first], list(range(problem.fitted)), [])
     if problem.own_flows is None:
         return q[: problem.fitted], spreads, q
     first, rows = reference_rows(q)
@@ -426,7 +427,8 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         elif sets:
             common.append(np.zeros((len(sets[0][1]), len(found[1]))))
         sets.append(found)
-    return *fit(sets, problem.own_flows.unknowns, common), q
+    which = [*range(problem.own_flows.unknowns), *([9] if problem.own_flows.growth else [])]
+    return *fit(sets, which, common), q
 
 
 def solve(J, columns: ColumnSet, sampling: Sampling, estimator):
@@ -482,7 +484,7 @@ def measure(J, rho, problem, view, x, y, own=()):
     if problem.unknowns:
         q, (cov_q, *_), alone = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
-        for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=True):
+        for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=False):
             found[name] = (value, error)
     if problem.world_brightness:
         i = [columns.index("i", o) for o in problem.world_brightness]
