@@ -74,7 +74,8 @@ def _draw_panel(figure: Any, axes: Any, panel: Panel) -> None:
     if panel.image.ndim == 2:
         figure.colorbar(shown, ax=axes, shrink=0.85)
     if panel.arrows is not None:
-        step = panel.arrow_step or max(1, max(panel.image.shape[:2]) // 40)
+        usual = max(1, max(panel.image.shape[:2]) // 40)
+        step = panel.arrow_step or usual
         y, x = np.mgrid[step // 2 : panel.image.shape[0] : step, step // 2 : panel.image.shape[1] : step]
         u, v = panel.arrows[y, x, 0], panel.arrows[y, x, 1]
         length = np.hypot(u, v)
@@ -82,5 +83,5 @@ def _draw_panel(figure: Any, axes: Any, panel: Panel) -> None:
         kept = length < 3 * typical  # one wild arrow would hide the others
         axes.quiver(
             x[kept], y[kept], u[kept], v[kept],
-            color="#e4442b", angles="xy", scale_units="xy", scale=typical / (2.0 * step), width=0.004,
+            color="#e4442b", angles="xy", scale_units="xy", scale=typical / (2.0 * usual), width=0.004,
         )  # fmt: skip
