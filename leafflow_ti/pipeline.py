@@ -335,7 +335,7 @@ class Pipeline:
         has_value = np.isin(status, HAS_VALUE)
         for values in maps.values():
             # A degenerate window can defeat the arithmetic: no NaN without a status that says so.
-            status[has_value & np.isnan(values)] = Status.NOT_CONVERGED
+            status[has_value & ~np.isfinite(values)] = Status.NOT_CONVERGED
         return maps, status
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import test_range_flow
 from reference import chain
 from test_prefilter import assert_equals_twin
 from tolerances import SOLVERS, tolerance
@@ -28,6 +29,7 @@ SYSTEMS = [
     ("depth", "none", "line-x", None),
     ("depth", "camera", "square", None),
     ("affine-4d", "none", "line-x", "rotation"),
+    ("affine-scene-flow", "temporal", "line-x", "acceleration"),
 ]
 
 
@@ -48,7 +50,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(PREFILTERS) + 3} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(PREFILTERS) + 4} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -89,7 +91,8 @@ def on_vulkan_the_chain_equals_the_twin(
         scale = np.sqrt(np.diag(J))
         assert np.max(np.abs(b.tensor(*pixel) - J) / np.outer(scale, scale)) <= limit.tensor
         assert found.status[pixel] == Status.OK
-        reference = chain.measure(J, rho, found.problem, b.view, *b.position(*pixel))
+        own = b.own_reference(*pixel) if found.problem.own_flows else ()
+        reference = chain.measure(J, rho, found.problem, b.view, *b.position(*pixel), own)
         for name, (value, std) in reference.items():
             map_value, map_std = (m[pixel] for m in found.map(name))
             assert abs(map_value - value) <= limit.maps * std, name
@@ -99,6 +102,10 @@ def on_vulkan_the_chain_equals_the_twin(
 @pytest.mark.parametrize("kind", PREFILTERS)
 def on_vulkan_the_prefilter_equals_the_twin(device: Callable, kind: str) -> None:
     assert_equals_twin(device("f32"), kind, 1e-6)
+
+
+def on_vulkan_range_flow_equals_the_twin(device: Callable) -> None:
+    test_range_flow.check(device("f32"), "taylor", "none", "tls-equilibrated")
 
 
 def on_vulkan_the_solvers_agree(bench: Callable) -> None:

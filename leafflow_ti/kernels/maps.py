@@ -46,6 +46,7 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
         int(s) for s in (Status.OK, Status.NO_STRUCTURE, Status.APERTURE, Status.INCOHERENT)
     )
     not_converged, border = int(Status.NOT_CONVERGED), int(Status.BORDER)
+    nan = float("nan")
 
     @ti.func
     def put(out: ti.template(), plane: ti.i32, pixel: ti.i32, n_pixels: ti.i32, value: precise, variance: precise):
@@ -218,7 +219,10 @@ def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
                 if place >= 0:
                     q = base + (number[Region.MOTION] + j) * stride + i
                     cov = base + (number[Region.MOTION_COV] + place * n + place) * stride + i
-                    put(out, Output.MOTION + j, pixel + i, n_pixels, ws[q], ws[cov])
+                    # Where no row was left the equations are singular: no number rather than any.
+                    determined = ws[cov] > 0 and ws[cov] < precise(1e30)
+                    found = ti.select(determined, ws[q], precise(nan))
+                    put(out, Output.MOTION + j, pixel + i, n_pixels, found, ws[cov])
             if n >= 3:
                 for axis in range(2):
                     for r in range(3):
