@@ -272,7 +272,9 @@ class Bench:
                 )
                 tensors = self._own_tensors
         problem = Problem(self.columns, self.sampling, **options)
-        stage = EstimateStage(self.device, problem, self.layout, self.view)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("leafflow_ti.stages.estimate.BATCH_BYTES", 64 << 20)  # one batch: its workspace is looked at
+            stage = EstimateStage(self.device, problem, self.layout, self.view)
         planes = np.array(stage(self._tensor[1], tensors))
         k, flow = self.columns.n_time_like, self.columns.n_flow
         parameters = self._region(stage, Region.PARAMETERS, k * flow)
