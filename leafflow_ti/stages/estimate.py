@@ -91,7 +91,7 @@ class Problem:
     use_range: bool = False
     fitted: int = 0
     own_flows: OwnFlows | None = None
-    passes: int = 3
+    passes: int = 2
     iterations: int = 4
     range_scale: tuple[float, float] | None = None
 
