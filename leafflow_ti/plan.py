@@ -18,8 +18,8 @@ from leafflow_ti.filters import choose_filter_set, filter_set
 from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set, parse_rows
 from leafflow_ti.range_plan import RangePlan, range_problem
 from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.estimate import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.prefilter import prefilter_bytes
+from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -302,7 +302,7 @@ def _own_flows(
     steps = [(i - reference[1], j - reference[0]) for j in range(counts[0]) for i in range(counts[1])]
     if model.reference_rows:
         steps.remove((0, 0))
-    unknowns = {"translation": 3, "rotation": 6, "acceleration": 9}[motion]
+    unknowns = unknowns_of(motion, columns, all_cameras=True)
     kept = tuple(o for o in offsets if o == "1" or columns.index("x", o) is not None)
     growth = "x" in kept if config.model.deformation == "auto" else config.model.deformation == "growth"
     if growth and "x" not in kept:

@@ -13,7 +13,7 @@ from leafflow_ti.models import TensorLayout
 from leafflow_ti.range_flow import columns, images, smoothed_samples, white_noise, window_radius
 from leafflow_ti.range_source import GivenRange, open_range
 from leafflow_ti.sampling import Sampling
-from leafflow_ti.stages.estimate import Problem
+from leafflow_ti.stages.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,8 @@ from leafflow_ti.models import BRIGHTNESS, MODELS, OWN_FLOW, ColumnSet, TensorLa
 from leafflow_ti.plan import MOTION_NAMES
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.estimate import EstimateStage, OwnFlows, Problem, View, unknowns_of
+from leafflow_ti.stages.estimate import EstimateStage, View
+from leafflow_ti.stages.problem import OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, TensorStage
 from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
 
@@ -254,7 +255,10 @@ class Bench:
         )  # fmt: skip
 
     def estimate(self, motion: str | None = None, rows: str = "auto", **options: Any) -> Estimated:
-        """Run the per-pixel stages; ``motion`` None: without the motion fit."""
+        """Run the per-pixel stages; ``motion`` None: without the motion fit.
+
+        ``without``: own flows (by number) that are left out; ``lost``: own flows whose windows hold nothing.
+        """
         from leafflow_ti.kernels.workspace import Region
 
         tensors: list[Any] = []
@@ -265,12 +269,16 @@ class Bench:
             if model.own_flows:
                 sampling, columns = self.own_columns
                 own = tuple(o for o in offsets if columns.index("x", o) is not None) if model.reference_rows else ("1",)
-                unknowns = {"translation": 3, "rotation": 6, "acceleration": 9}[motion]
+                unknowns = unknowns_of(motion, columns, all_cameras=True)
                 growth = bool(options.pop("growth", "x" in own))
+                without = options.pop("without", ())
+                kept = [i for i in range(len(self.steps)) if i not in without]
+                tensors = [self._own_tensors[i] for i in kept]
+                for i in options.pop("lost", ()):
+                    tensors[i] = self.device.array(np.zeros_like(self.device.host(tensors[i])))
                 options["own_flows"] = OwnFlows(
-                    columns, sampling, self.steps, own, unknowns, model.reference_rows, growth
+                    columns, sampling, tuple(self.steps[i] for i in kept), own, unknowns, model.reference_rows, growth
                 )
-                tensors = self._own_tensors
         problem = Problem(self.columns, self.sampling, **options)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("leafflow_ti.stages.estimate.BATCH_BYTES", 64 << 20)  # one batch: its workspace is looked at

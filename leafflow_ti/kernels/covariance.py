@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.spec import KernelSpec
+from leafflow_ti.kernels.texture import texture_function
 from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Region, Value, batch_kernel
 
 
@@ -18,18 +19,7 @@ from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Region, Value, batch
 def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``row_covariance`` and ``add_camera``, per solution, and ``geometry``."""
     precise, lanes = spec.precise, spec.lanes
-    small = dense(spec)
-
-    @ti.func
-    def texture_smoothness(pixel: ti.i32, n_pixels: ti.i32, number: ti.template(), J: ti.template()):
-        """The factor ρ of each lane."""
-        rho = ti.Vector.zero(precise, lanes)
-        energy = (number[Number.EXTRA] + 1) * n_pixels + pixel
-        for i in range(lanes):
-            plain = ti.cast(J[energy + i], precise)
-            smooth = ti.cast(J[energy + n_pixels + i], precise)
-            rho[i] = ti.select(plain > 0, ti.min(smooth / plain, precise(1.0)), precise(1.0))
-        return rho
+    small, smoothness = dense(spec), texture_function(spec)
 
     @ti.func
     def row_covariance(
@@ -128,7 +118,7 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
         small.cholesky(ws, clean, flow, floor, stride)
         small.solve(ws, clean, response_at, flow, n_rows, stride)
         small.symmetric_times(ws, noise, response_at, product, flow, n_rows, stride)
-        factor_of = texture_smoothness(pixel, n_pixels, number, J)
+        factor_of = smoothness(pixel, n_pixels, number, J)
         for i in range(lanes):
             factor_of[i] *= ws[variance + i]
         for r in range(n_rows):
@@ -148,7 +138,7 @@ def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
         cross = base + number[Region.CROSS] * stride
         one_at = base + number[Region.RESPONSE_S] * stride
         two_at = base + number[Region.RESPONSE_T] * stride
-        factor_of = texture_smoothness(pixel, n_pixels, number, J)
+        factor_of = smoothness(pixel, n_pixels, number, J)
         first = base + (number[Region.VARIANCE] + camera) * stride
         second = base + (number[Region.VARIANCE] + number[Number.MOTION_SOLUTION]) * stride
         for i in range(lanes):

@@ -4,7 +4,7 @@ import functools
 
 from leafflow_ti.kernels.dense import tri
 from leafflow_ti.kernels.engine import ti
-from leafflow_ti.kernels.patch_fit import patch_functions
+from leafflow_ti.kernels.patch import patch_functions
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.workspace import Number, Region, Value, batch_kernel
 

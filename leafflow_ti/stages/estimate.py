@@ -24,6 +24,7 @@ from leafflow_ti.sampling import (
     white_smoothness,
 )
 from leafflow_ti.stages.estimators import ESTIMATORS
+from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, OwnFlows, Problem
 
 BATCH_BYTES = 8 << 20
 """Workspace of one batch of pixels: it should stay in the processor's cache."""
@@ -53,94 +54,6 @@ MIN_MASS = 0.2
 """Least share of the window's weight that must lie inside the images (a corner pixel has 1/4)."""
 MAX_RESIDUAL_PX = 0.5
 """Root mean square misfit of the brightness constraint, as a displacement, above which a window is incoherent."""
-
-
-@dataclass(frozen=True)
-class OwnFlows:
-    """The flows of single cameras in the motion fit (6.15): their data vector, and where the cameras stand.
-
-    ``steps``: (x, y) steps of each camera from the reference. ``offsets``: of their rows. ``unknowns``: components of
-    (N, Ω, A) in the fit; ``growth``: and the rate at which the patch grows in its plane.
-    ``reference_rows``: the rows of the reference model take part, too.
-    """
-
-    columns: ColumnSet
-    sampling: Sampling
-    steps: tuple[tuple[int, int], ...]
-    offsets: tuple[str, ...]
-    unknowns: int
-    reference_rows: bool
-    growth: bool = False
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What is estimated: columns, geometry terms, motion rows; independent of band and device.
-
-    ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``fitted``: unknowns of the motion fit to the
-    reference's rows (0: none), from which a fit with ``own_flows`` starts. ``range_scale``: of range flow, mm per px of
-    (U', V') and of W.
-    """
-
-    columns: ColumnSet
-    sampling: Sampling
-    estimator: str = "tls-equilibrated"
-    solver: str = "fast"
-    weighted: bool = True
-    offsets: tuple[str, ...] = ("1",)
-    use_range: bool = False
-    fitted: int = 0
-    own_flows: OwnFlows | None = None
-    passes: int = 2
-    iterations: int = 4
-    range_scale: tuple[float, float] | None = None
-
-    @property
-    def unknowns(self) -> int:
-        """Components of (N, Ω, A) that are measured."""
-        return self.own_flows.unknowns if self.own_flows else self.fitted
-
-    @property
-    def terms(self) -> tuple[str, ...]:
-        """Geometry terms: the offsets of the disparity that enter the surface fit."""
-        if not self.camera_axes:
-            return ()
-        return tuple(o for o in ("1", "x", "y", "t") if self.columns.index("x", o) is not None)
-
-    @property
-    def brightness(self) -> tuple[str, ...]:
-        """Offsets of the brightness change in time that are measured."""
-        if "t" not in self.columns.solutions:
-            return ()
-        return tuple(o for o in ("1", "x", "y", "t") if self.columns.index("i", o) is not None)
-
-    @property
-    def world_brightness(self) -> tuple[str, ...]:
-        """Of these, the ones that geometry (for the slopes) and motion (for the trend) carry into the world (4.28)."""
-        if not {"x", "y"} <= {*self.brightness} & {*self.terms}:
-            return ()
-        return tuple(o for o in self.brightness if o in ("x", "y") or (o == "t" and self.unknowns))
-
-    @property
-    def camera_axes(self) -> tuple[str, ...]:
-        """Camera axes with a solution."""
-        return tuple(a for a in self.columns.solutions if a != "t")
-
-
-def unknowns_of(motion: str, columns: ColumnSet) -> int:
-    """How many of (N, Ω, A) one camera's flow determines.
-
-    Without offsets along x, y the velocity along Z is not seen and taken as zero; nor is, from one camera, the
-    acceleration along Z: it enters as ``A_X - x/f A_Z``, ``A_Y - y/f A_Z`` only.
-    """
-    if columns.index("x", "x") is None:
-        return 2
-    return {"translation": 3, "rotation": 6, "acceleration": 8}[motion]
-
-
-BRIGHTNESS_MAPS = {"1": "brightness_t", "x": "brightness_tx", "y": "brightness_ty", "t": "brightness_tt"}
-WORLD_MAPS = {"x": "brightness_world_x", "y": "brightness_world_y", "t": "brightness_world_tt"}
-"""Offset of the brightness change in time -> name of its map, in the image and on the material."""
 
 
 def _solution_noise(
@@ -250,7 +163,7 @@ class EstimateStage:
     @staticmethod
     def _set_unknowns(number: NDArray[np.int32], n: int, growth: bool = False) -> None:
         """The unknowns are the first ``n`` components of (N, Ω, A), and the growth behind them."""
-        from leafflow_ti.kernels.patch_fit import GROWTH
+        from leafflow_ti.kernels.patch import GROWTH
         from leafflow_ti.kernels.workspace import Number
 
         number[Number.UNKNOWNS] = n + growth
@@ -262,7 +175,7 @@ class EstimateStage:
         self, columns: ColumnSet, sampling: Sampling, layout: TensorLayout, offsets: Sequence[str], rows: Sequence[int]
     ) -> _Tables:
         """What the tables of every data vector hold: columns, noise, the motion rows."""
-        from leafflow_ti.kernels.patch_fit import RANGE_CODE
+        from leafflow_ti.kernels.patch import RANGE_CODE
         from leafflow_ti.kernels.workspace import Number, Region, Value
 
         problem, precision = self.problem, self.device.algebra
