@@ -116,6 +116,27 @@ def test_submodels_of_the_affine_scene_flow(bench: Callable, grid: str, motion: 
         assert_maps_equal(b, b.estimate(motion, rows, growth=growth and rows.startswith("2d")))
 
 
+@pytest.mark.parametrize("model", ["scene-flow", "affine-scene-flow"])
+def test_a_lost_camera_is_as_if_it_were_not_there(bench: Callable, precision: str, model: str) -> None:
+    """A window that has left one camera's image must not cost the pixel, nor move it."""
+    b = bench(model, "none", "line-x", precision)
+    motion = MODELS[model].motions[0]
+    lost, without = b.estimate(motion, lost=(0,)), b.estimate(motion, without=(0,))
+    whole = b.estimate(motion)
+    assert np.all(lost.status == Status.OK)
+    for name in ("velocity_x", "velocity_y", "velocity_z"):
+        for one, other in zip(lost.map(name), without.map(name), strict=True):
+            assert np.all(np.isfinite(one))
+            np.testing.assert_allclose(one, other, rtol=1e-6)
+        assert np.all(lost.map(name)[0] != whole.map(name)[0])
+
+
+def test_without_any_camera_there_is_no_motion(bench: Callable) -> None:
+    b = bench("scene-flow", "none", "line-x", "f64")
+    found = b.estimate("translation", lost=tuple(range(len(b.steps))))
+    assert np.all(np.isnan(found.map("velocity_z")[0]))
+
+
 @pytest.mark.parametrize("estimator", ["ols", "tls"])
 def test_maps_of_the_other_estimators(bench: Callable, precision: str, estimator: str) -> None:
     b = bench("affine-4d", "spatial", "line-x", precision)
