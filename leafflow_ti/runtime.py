@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import platformdirs
+from numpy.typing import NDArray
 
 from leafflow_ti.errors import DeviceError
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 ARCHES = ("cuda", "metal", "vulkan", "cpu")
 PLANE_LANES = 64
 DENSE_LANES = {"f32": 32, "f64": 16}
+ALIGNMENT = 256
+"""Bytes: whole vectors are loaded from aligned addresses."""
 _lock = threading.Lock()
 
 
@@ -65,6 +68,10 @@ class Device:
 
         return KernelSpec(self.storage, self.algebra, 1 if self.gpu else DENSE_LANES[self.algebra], self.gpu)
 
+    def vectors(self, array: Any, lanes: int) -> Any:
+        """A flat array as kernels on ``lane_type`` values take it: [size // lanes, lanes]; as it is with one lane."""
+        return array if lanes == 1 else array.reshape(-1, lanes)
+
     def tasks(self, n_groups: int) -> int:
         """Into how many tasks the groups of a launch are cut on the CPU."""
         return max(1, min(n_groups, 8 * self.threads))
@@ -77,7 +84,7 @@ class Device:
         """A flat array of the device, contents undefined; ``kind`` is "storage", "algebra" or "int"."""
         dtype = np.int32 if kind == "int" else self.real(kind)
         if not self.gpu:
-            return np.empty(size, dtype)
+            return _aligned(size, dtype)
         from leafflow_ti.kernels.engine import ti
 
         return ti.ndarray({np.int32: ti.i32, np.float32: ti.f32, np.float64: ti.f64}[dtype], (size,))
@@ -86,6 +93,9 @@ class Device:
         """A flat array of the device with these values."""
         host = np.ascontiguousarray(values, np.int32 if kind == "int" else self.real(kind)).ravel()
         if not self.gpu:
+            if host.ctypes.data % ALIGNMENT:
+                host, values = _aligned(host.size, host.dtype), host
+                host[:] = values
             return host
         result = self.empty(host.size, kind)
         result.from_numpy(host)
@@ -110,6 +120,14 @@ class Device:
             from leafflow_ti.kernels.engine import ti
 
             ti.sync()
+
+
+def _aligned(size: int, dtype: Any) -> NDArray[Any]:
+    """A flat array that begins at a multiple of ``ALIGNMENT``, contents undefined."""
+    itemsize = np.dtype(dtype).itemsize
+    raw = np.empty(size * itemsize + ALIGNMENT, np.uint8)
+    first = -raw.ctypes.data % ALIGNMENT
+    return raw[first : first + size * itemsize].view(dtype)
 
 
 def cache_folder() -> Path:
