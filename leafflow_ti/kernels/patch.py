@@ -7,11 +7,14 @@ part times the window's second moment belongs to the row of the flow itself.
 """
 
 import functools
+from enum import IntEnum
 from types import SimpleNamespace
 
+from leafflow_ti.kernels.dense import dense
 from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.spec import KernelSpec
-from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Value
+from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, PATCH_SIZE, Number, Region, Value
 
 RANGE_CODE = 6
 """Code of the range constraint, behind those of the motion rows' offsets."""
@@ -19,106 +22,159 @@ GROWTH = 9
 """Place of ε among the components (N, Ω, A, ε) of the motion."""
 
 
+class Patch(IntEnum):
+    """Elements of ``Region.PATCH``: the ray ``(x/f, y/f)`` of a camera to the patch, and the surface there."""
+
+    X = 0
+    Y = 1
+    DEPTH = 2
+    SLOPE_X = 3
+    SLOPE_Y = 4
+    C = 5  # 1 - ZX x/f - ZY y/f
+    SEEN_X = 6  # the reference camera's ray
+    SEEN_Y = 7
+
+
+assert len(Patch) <= PATCH_SIZE
+
+
 @functools.cache
 def patch_functions(spec: KernelSpec) -> SimpleNamespace:
-    """Formulas of one patch, for one pixel: ``pixel_ray``, ``surface``, ``motion_row`` and ``range_row``."""
-    precise = spec.precise
-    vec3 = ti.types.vector(3, precise)
-    vec_q = ti.types.vector(MAX_UNKNOWNS, precise)
+    """``pixel_ray``, ``place_patch``, and ``motion_row``, ``range_row``, which leave an equation in ``Region.ROW``."""
+    precise, lanes, V = spec.precise, spec.lanes, spec.element
+    small = dense(spec)
 
     @ti.func
-    def pixel_ray(pixel: ti.i32, number: ti.template(), value: ti.template()):
-        """``(x0/f, y0/f)`` of an output pixel."""
-        row = pixel // number[Number.PITCH]
-        col = pixel - row * number[Number.PITCH]
-        x = ti.cast(number[Number.OUT_X] + number[Number.STEP] * col, precise) - value[Value.PX]
-        y = ti.cast(number[Number.OUT_Y] + number[Number.STEP] * row, precise) - value[Value.PY]
-        return ti.Vector([x / value[Value.F], y / value[Value.F]], dt=precise)
+    def pixel_ray(p: ti.template(), number: ti.template(), value: ti.template()):
+        """``(x0/f, y0/f)`` of the group's pixels."""
+        row = p.pixel // number[p.n + Number.PITCH]
+        col = p.pixel - row * number[p.n + Number.PITCH]
+        first = ti.cast(number[p.n + Number.OUT_X] + number[p.n + Number.STEP] * col, precise) - value[p.v + Value.PX]
+        y = ti.cast(number[p.n + Number.OUT_Y] + number[p.n + Number.STEP] * row, precise) - value[p.v + Value.PY]
+        x = V(first)
+        if ti.static(lanes > 1):
+            for i in ti.static(range(lanes)):
+                x[i] = first + ti.cast(number[p.n + Number.STEP] * i, precise)
+        return x / value[p.v + Value.F], V(y / value[p.v + Value.F])
 
     @ti.func
-    def surface(ray: ti.template(), f: precise, nu: precise, b1: precise, b2: precise):
-        """``(Z0, ZX, ZY, c)`` of Eqs. (6.13), (6.14)."""
-        Z0 = -f / nu
+    def place_patch(
+        nu: ti.template(), b1: ti.template(), b2: ti.template(), p: ti.template(), number: ti.template(),
+        value: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """``(Z0, ZX, ZY)`` of Eqs. (6.13), (6.14) at the reference's ray, and ``c`` at the camera's."""
+        patch = region(p, number, Region.PATCH)
+        Z0 = (0.0 - value[p.v + Value.F]) / nu
         P = b1 * Z0
         Q = b2 * Z0
-        c = 1 / (1 + P * ray[0] + Q * ray[1])
-        return ti.Vector([Z0, c * P, c * Q, c], dt=precise)
+        c = 1.0 / (1.0 + P * ws[patch + Patch.SEEN_X * p.stride] + Q * ws[patch + Patch.SEEN_Y * p.stride])
+        ZX = c * P
+        ZY = c * Q
+        ws[patch + Patch.DEPTH * p.stride] = Z0
+        ws[patch + Patch.SLOPE_X * p.stride] = ZX
+        ws[patch + Patch.SLOPE_Y * p.stride] = ZY
+        x, y = ws[patch + Patch.X * p.stride], ws[patch + Patch.Y * p.stride]
+        ws[patch + Patch.C * p.stride] = 1.0 - ZX * x - ZY * y
 
     @ti.func
-    def bare_row(k: ti.i32, code: ti.i32, ray: ti.template(), f: precise, s: ti.template(), N: ti.template()):
-        """Coefficients of (N, Ω, A, ε) in ``a_k,m`` (5.18); codes 0 = the motion itself, 1.. = x, y, sx, sy, t."""
-        Z0, ZX, ZY, c = s[0], s[1], s[2], s[3]
-        x, y = ray[0], ray[1]
-        nu = -f / Z0
-        e = vec3(1, 0, -x)
-        if k == 1:
-            e = vec3(0, 1, -y)
-        row = vec_q(0)
+    def add_row(
+        k: ti.i32, code: ti.i32, factor: precise, p: ti.template(), number: ti.template(), value: ti.template(),
+        ws: ti.template(),
+    ):  # fmt: skip
+        """Add ``factor`` times the coefficients of (N, Ω, A, ε) in ``a_k,m`` (5.18) to the row; codes 0 = the motion
+        itself, 1.. = x, y, sx, sy, t.
+
+        With h = Z0/f for x, y and 1 for the others, and g the slope (for t: Zt), every world derivative of (5.8) is
+        ``h g/c (x, y, f)/f + h (unit vector along its axis)``, and every b is ``h g f / (Z0² c)``.
+        """
+        row, patch = region(p, number, Region.ROW), region(p, number, Region.PATCH)
+        motion = region(p, number, Region.MOTION)
+        f, stride = value[p.v + Value.F], p.stride
+        x, y, Z0 = ws[patch + Patch.X * stride], ws[patch + Patch.Y * stride], ws[patch + Patch.DEPTH * stride]
+        # e_k = (1, 0, -x) or (0, 1, -y)
+        second = ti.cast(k, precise)
+        first = 1.0 - second
+        along = 0.0 - (x * first + y * second)
+        scale = V(factor * f) / Z0  # -factor nu
         if code == 0:
-            for j in ti.static(range(3)):
-                row[j] = -nu * e[j]
+            ws[row] = ws[row] + scale * first
+            ws[row + stride] = ws[row + stride] + scale * second
+            ws[row + 2 * stride] = ws[row + 2 * stride] + scale * along
         else:
-            Zt = N[2] - ZX * N[0] - ZY * N[1]
-            delta = vec3(0)
-            b = precise(0.0)
-            if code == 1:
-                delta = Z0 / (f * c) * vec3(1 - ZY * y, ZX * y, ZX)
-                b = ZX / (Z0 * c)
-            elif code == 2:
-                delta = Z0 / (f * c) * vec3(ZY * x, 1 - ZX * x, ZY)
-                b = ZY / (Z0 * c)
-            elif code == 3:
-                delta = vec3(c + ZX * x, ZX * y, ZX) / c
-                b = f * ZX / (Z0 * Z0 * c)
-            elif code == 4:
-                delta = vec3(ZY * x, c + ZY * y, ZY) / c
-                b = f * ZY / (Z0 * Z0 * c)
+            ZX, ZY = ws[patch + Patch.SLOPE_X * stride], ws[patch + Patch.SLOPE_Y * stride]
+            slope, h = ZX, V(1.0)
+            if code == 2 or code == 4:
+                slope = ZY
+            if code < 3:
+                h = Z0 / f
+            N0, N1, N2 = ws[motion], ws[motion + stride], ws[motion + 2 * stride]
+            if code == 5:
+                slope = N2 - ZX * N0 - ZY * N1
+            d2 = h * slope / ws[patch + Patch.C * stride]
+            d0 = d2 * x
+            d1 = d2 * y
+            b = d2 * (f * factor) / (Z0 * Z0)
+            if code == 1 or code == 3:
+                d0 = d0 + h
+            elif code == 5:
+                d0 = d0 - N0
+                d1 = d1 - N1
+                d2 = d2 - N2
             else:
-                delta = Zt / c * vec3(x, y, 1) - vec3(N[0], N[1], N[2])
-                b = f * Zt / (Z0 * Z0 * c)
-            turn = delta.cross(e)
-            for j in ti.static(range(3)):
-                row[j] = -b * e[j]
-                row[3 + j] = -nu * turn[j]
-                if code == 5:
-                    row[6 + j] = -nu * e[j]
-            row[GROWTH] = -nu * delta.dot(e)
+                d1 = d1 + h
+            ws[row] = ws[row] - b * first
+            ws[row + stride] = ws[row + stride] - b * second
+            ws[row + 2 * stride] = ws[row + 2 * stride] - b * along
             if code == k + 1:
-                row[2] += nu / f
-        return row
+                ws[row + 2 * stride] = ws[row + 2 * stride] - scale / f
+            # -nu δ × e
+            ws[row + 3 * stride] = ws[row + 3 * stride] + scale * (d1 * along - d2 * second)
+            ws[row + 4 * stride] = ws[row + 4 * stride] + scale * (d2 * first - d0 * along)
+            ws[row + 5 * stride] = ws[row + 5 * stride] + scale * (d0 * second - d1 * first)
+            if code == 5:
+                ws[row + 6 * stride] = ws[row + 6 * stride] + scale * first
+                ws[row + 7 * stride] = ws[row + 7 * stride] + scale * second
+                ws[row + 8 * stride] = ws[row + 8 * stride] + scale * along
+            grown = d0 * first + d1 * second + d2 * along
+            ws[row + GROWTH * stride] = ws[row + GROWTH * stride] + scale * grown
 
     @ti.func
     def motion_row(
-        k: ti.i32, code: ti.i32, ray: ti.template(), s: ti.template(), N: ti.template(), value: ti.template()
+        k: ti.i32, code: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
     ):
         """The row as the window and the preshifted data measure it, per camera step along s."""
-        f = value[Value.F]
+        row, patch, stride = region(p, number, Region.ROW), region(p, number, Region.PATCH), p.stride
+        small.clear(ws, row, MAX_UNKNOWNS, stride)
         along_s = code == 3 or code == 4
-        row = vec_q(0)
         for part in range(ti.select(along_s, 2, 1)):
             factor = precise(1.0)
             if along_s:
-                factor = value[ti.select(part == 0, Value.BASELINE, Value.SHIFT) + code - 3]
-            row += factor * bare_row(k, ti.select(part == 0, code, code - 2), ray, f, s, N)
+                factor = value[p.v + ti.select(part == 0, Value.BASELINE, Value.SHIFT) + code - 3]
+            add_row(k, ti.select(part == 0, code, code - 2), factor, p, number, value, ws)
         if code == 0:
             # Half the second derivative of u_k along its own axis: -T_Z d(1/Z) + (Ω × e_Z)_k / f, where T = N - Ω × X0
             # - ε X0 is the velocity that the patch's motion has at the camera; along the other axis it vanishes.
-            moment = value[Value.SECOND_MOMENT + k]
-            bend = moment * s[1 + k] / (f * s[0] * s[3])
-            row[2] += bend
-            row[3] -= bend * s[0] * ray[1] + ti.select(k == 1, moment / f, precise(0.0))
-            row[4] += bend * s[0] * ray[0] + ti.select(k == 0, moment / f, precise(0.0))
-            row[GROWTH] -= bend * s[0]
-        return row
+            f, moment = value[p.v + Value.F], value[p.v + Value.SECOND_MOMENT + k]
+            Z0, c = ws[patch + Patch.DEPTH * stride], ws[patch + Patch.C * stride]
+            # bend Z0 = moment slope / (f c)
+            bent = ws[patch + (Patch.SLOPE_X + k) * stride] / c * (moment / f)
+            turned = moment / f
+            ws[row + 2 * stride] = ws[row + 2 * stride] + bent / Z0
+            about_x = bent * ws[patch + Patch.Y * stride] + ti.select(k == 1, turned, precise(0.0))
+            ws[row + 3 * stride] = ws[row + 3 * stride] - about_x
+            about_y = bent * ws[patch + Patch.X * stride] + ti.select(k == 0, turned, precise(0.0))
+            ws[row + 4 * stride] = ws[row + 4 * stride] + about_y
+            ws[row + GROWTH * stride] = ws[row + GROWTH * stride] - bent
 
     @ti.func
-    def range_row(f: precise, s: ti.template()):
+    def range_row(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Coefficients of the range constraint ``b_t`` (5.23)."""
-        row = vec_q(0)
-        scale = f / (s[0] * s[0] * s[3])
-        row[0] = -scale * s[1]
-        row[1] = -scale * s[2]
-        row[2] = scale
-        return row
+        row, patch, stride = region(p, number, Region.ROW), region(p, number, Region.PATCH), p.stride
+        small.clear(ws, row, MAX_UNKNOWNS, stride)
+        Z0 = ws[patch + Patch.DEPTH * stride]
+        scale = V(value[p.v + Value.F]) / (Z0 * Z0 * ws[patch + Patch.C * stride])
+        ws[row] = 0.0 - scale * ws[patch + Patch.SLOPE_X * stride]
+        ws[row + stride] = 0.0 - scale * ws[patch + Patch.SLOPE_Y * stride]
+        ws[row + 2 * stride] = scale
 
-    return SimpleNamespace(pixel_ray=pixel_ray, surface=surface, motion_row=motion_row, range_row=range_row)
+    return SimpleNamespace(pixel_ray=pixel_ray, place_patch=place_patch, motion_row=motion_row, range_row=range_row)
