@@ -282,7 +282,7 @@ class Bench:
         problem = Problem(self.columns, self.sampling, **options)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("leafflow_ti.stages.estimate.BATCH_BYTES", 64 << 20)  # one batch: its workspace is looked at
-            stage = EstimateStage(self.device, problem, self.layout, self.view)
+            stage = EstimateStage(self.device, problem, self.layout, self.view, apart=True)
         planes = np.array(stage(self._tensor[1], tensors))
         k, flow = self.columns.n_time_like, self.columns.n_flow
         parameters = self._region(stage, Region.PARAMETERS, k * flow)

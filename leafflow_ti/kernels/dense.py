@@ -1,8 +1,8 @@
 """Small dense matrices, one per lane: functions on a workspace whose elements are vectors over the lanes.
 
-Element ``e`` of a group is ``ws[base + e * stride]``. On the CPU ``stride = 1``; on a GPU, with one lane, ``base`` is the
-group and ``stride`` the number of groups, so that neighbouring threads read neighbouring words. A lower triangle is
-packed by rows: element (r, c) at ``r (r + 1) / 2 + c``.
+Element ``e`` of a group is ``ws[base + e * stride]``. On the CPU ``stride = 1``; on a GPU, with one lane, ``base`` is
+the group and ``stride`` the number of groups, so that neighbouring threads read neighbouring words. A lower triangle
+is packed by rows: element (r, c) at ``r (r + 1) / 2 + c``.
 """
 
 import functools
@@ -29,12 +29,12 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
     def any_lane(mask: ti.template()) -> ti.i32:
         """Whether a condition holds in a lane."""
         flag = ti.select(mask, V(1.0), V(0.0))
-        found = 0
-        if ti.static(lanes > 1):
-            found = ti.cast(flag.max() > 0.5, ti.i32)
+        largest = precise(0.0)
+        if ti.static(lanes > 1):  # noqa: SIM108 - the engine decides between statements only
+            largest = flag.max()
         else:
-            found = ti.cast(flag > 0.5, ti.i32)
-        return found
+            largest = flag
+        return ti.cast(largest > 0.5, ti.i32)
 
     @ti.func
     def magnitude(x: ti.template()):

@@ -4,7 +4,7 @@ import functools
 from enum import IntEnum
 from types import SimpleNamespace
 
-from leafflow_ti.kernels.dense import dense, tri
+from leafflow_ti.kernels.dense import tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.patch import patch_functions
@@ -42,11 +42,18 @@ class Output(IntEnum):
 def maps_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``measured`` (all maps but the motion), ``motion``, and ``emit``, which writes them to the planes."""
     real, precise, lanes, V = spec.real, spec.precise, spec.lanes, spec.element
-    small, patch = dense(spec), patch_functions(spec)
+    patch = patch_functions(spec)
+    ok, no_structure, aperture, incoherent = (
+        float(s) for s in (Status.OK, Status.NO_STRUCTURE, Status.APERTURE, Status.INCOHERENT)
+    )
+    not_converged, border = float(Status.NOT_CONVERGED), float(Status.BORDER)
     nan = float("nan")
 
     @ti.func
-    def put(plane: ti.i32, result: ti.template(), variance: ti.template(), p: ti.template(), target: ti.i32, ws: ti.template()):
+    def put(
+        plane: ti.i32, result: ti.template(), variance: ti.template(), p: ti.template(), target: ti.i32,
+        ws: ti.template(),
+    ):  # fmt: skip
         """One map and its standard error."""
         ws[target + plane * p.stride] = result
         ws[target + (Output.STD + plane) * p.stride] = ti.sqrt(ti.max(variance, V(0.0)))
@@ -60,7 +67,8 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         xy = ws[moments + number[p.n + Number.LOWER + tri(iy, ix)] * p.stride]
         yy = ws[moments + number[p.n + Number.LOWER + tri(iy, iy)] * p.stride]
         extra = moments + number[p.n + Number.EXTRA] * p.stride
-        mass, gradient, smooth, level = ws[extra], ws[extra + p.stride], ws[extra + 2 * p.stride], ws[extra + 3 * p.stride]
+        mass, gradient = ws[extra], ws[extra + p.stride]
+        smooth, level = ws[extra + 2 * p.stride], ws[extra + 3 * p.stride]
         solutions = number[p.n + Number.SOLUTIONS]
         noise, energy, farthest = V(0.0), V(0.0), V(0.0)
         for j in range(solutions):
@@ -78,18 +86,18 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         half = (xx + yy) * 0.5
         weakest = half - ti.sqrt(ti.max(half * half - (xx * yy - xy * xy), V(0.0)))
         # From the last reason to the first, which is the one that counts.
-        result = ti.select(farthest > V(0.5), V(Status.INCOHERENT), V(Status.OK))
-        result = ti.select((weakest < floor) | (weakest < half * 1e-4), V(Status.APERTURE), result)
+        result = ti.select(farthest > V(0.5), V(incoherent), V(ok))
+        result = ti.select((weakest < floor) | (weakest < half * 1e-4), V(aperture), result)
         unsolved = ws[region(p, number, Region.CONVERGED)] < V(0.5)
-        result = ti.select(unsolved, V(Status.NOT_CONVERGED), result)
+        result = ti.select(unsolved, V(not_converged), result)
         largest = value[p.v + Value.MAX_RESIDUAL]
-        result = ti.select(energy < half * (2.0 * largest * largest), result, V(Status.INCOHERENT))
+        result = ti.select(energy < half * (2.0 * largest * largest), result, V(incoherent))
         # The constraint explains nothing: there is nothing but noise, or texture that does not move as one.
         rough = smooth > gradient * value[p.v + Value.ROUGHEST]
-        nothing = ti.select(rough, V(Status.INCOHERENT), V(Status.NO_STRUCTURE))
+        nothing = ti.select(rough, V(incoherent), V(no_structure))
         result = ti.select(half > floor, result, nothing)
-        result = ti.select(half > level * value[p.v + Value.MIN_STRUCTURE], result, V(Status.NO_STRUCTURE))
-        return ti.select(mass < V(value[p.v + Value.MIN_MASS]), V(Status.BORDER), result)
+        result = ti.select(half > level * value[p.v + Value.MIN_STRUCTURE], result, V(no_structure))
+        return ti.select(mass < V(value[p.v + Value.MIN_MASS]), V(border), result)
 
     @ti.func
     def geometry_maps(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
@@ -191,7 +199,8 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
             for k in range(2):
                 row = k * number[p.n + Number.OFFSETS]
                 column = number[p.n + Number.MOTION_SOLUTION] * flow + number[p.n + Number.FLOW_ROWS + k]
-                put(Output.FLOW_X + k, ws[found + column * p.stride], ws[rows + tri(row, row) * p.stride], p, target, ws)
+                variance = ws[rows + tri(row, row) * p.stride]
+                put(Output.FLOW_X + k, ws[found + column * p.stride], variance, p, target, ws)
         if number[p.n + Number.BRIGHTNESS_COLUMN] >= 0:
             for j in range(number[p.n + Number.CAMERA_SOLUTIONS]):
                 at = found + (j * flow + number[p.n + Number.BRIGHTNESS_COLUMN]) * p.stride

@@ -45,9 +45,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
             ws[moments + k * p.stride] = element
 
     @ti.func
-    def scaled(
-        r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
-    ):
+    def scaled(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Element (r, c), r >= c, of ``S J S``."""
         at = region(p, number, Region.MOMENTS) + number[p.n + Number.LOWER + tri(r, c)] * p.stride
         return ws[at] * (value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c])

@@ -30,9 +30,10 @@ class Patch(IntEnum):
     DEPTH = 2
     SLOPE_X = 3
     SLOPE_Y = 4
-    C = 5  # 1 - ZX x/f - ZY y/f
-    SEEN_X = 6  # the reference camera's ray
-    SEEN_Y = 7
+    INVERSE_C = 5  # 1 / (1 - ZX x/f - ZY y/f)
+    INVERSE_DEPTH = 6
+    SEEN_X = 7  # the reference camera's ray
+    SEEN_Y = 8
 
 
 assert len(Patch) <= PATCH_SIZE
@@ -64,17 +65,19 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
     ):  # fmt: skip
         """``(Z0, ZX, ZY)`` of Eqs. (6.13), (6.14) at the reference's ray, and ``c`` at the camera's."""
         patch = region(p, number, Region.PATCH)
-        Z0 = (0.0 - value[p.v + Value.F]) / nu
+        inverse = nu * (precise(-1.0) / value[p.v + Value.F])
+        Z0 = 1.0 / inverse
         P = b1 * Z0
         Q = b2 * Z0
         c = 1.0 / (1.0 + P * ws[patch + Patch.SEEN_X * p.stride] + Q * ws[patch + Patch.SEEN_Y * p.stride])
         ZX = c * P
         ZY = c * Q
         ws[patch + Patch.DEPTH * p.stride] = Z0
+        ws[patch + Patch.INVERSE_DEPTH * p.stride] = inverse
         ws[patch + Patch.SLOPE_X * p.stride] = ZX
         ws[patch + Patch.SLOPE_Y * p.stride] = ZY
         x, y = ws[patch + Patch.X * p.stride], ws[patch + Patch.Y * p.stride]
-        ws[patch + Patch.C * p.stride] = 1.0 - ZX * x - ZY * y
+        ws[patch + Patch.INVERSE_C * p.stride] = 1.0 / (1.0 - ZX * x - ZY * y)
 
     @ti.func
     def add_row(
@@ -90,12 +93,14 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         row, patch = region(p, number, Region.ROW), region(p, number, Region.PATCH)
         motion = region(p, number, Region.MOTION)
         f, stride = value[p.v + Value.F], p.stride
-        x, y, Z0 = ws[patch + Patch.X * stride], ws[patch + Patch.Y * stride], ws[patch + Patch.DEPTH * stride]
+        x, y = ws[patch + Patch.X * stride], ws[patch + Patch.Y * stride]
+        inverse = ws[patch + Patch.INVERSE_DEPTH * stride]
+        wide = precise(1.0) / f
         # e_k = (1, 0, -x) or (0, 1, -y)
         second = ti.cast(k, precise)
         first = 1.0 - second
         along = 0.0 - (x * first + y * second)
-        scale = V(factor * f) / Z0  # -factor nu
+        scale = inverse * (factor * f)  # -factor nu
         if code == 0:
             ws[row] = ws[row] + scale * first
             ws[row + stride] = ws[row + stride] + scale * second
@@ -106,14 +111,14 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
             if code == 2 or code == 4:
                 slope = ZY
             if code < 3:
-                h = Z0 / f
+                h = ws[patch + Patch.DEPTH * stride] * wide
             N0, N1, N2 = ws[motion], ws[motion + stride], ws[motion + 2 * stride]
             if code == 5:
                 slope = N2 - ZX * N0 - ZY * N1
-            d2 = h * slope / ws[patch + Patch.C * stride]
+            d2 = h * slope * ws[patch + Patch.INVERSE_C * stride]
             d0 = d2 * x
             d1 = d2 * y
-            b = d2 * (f * factor) / (Z0 * Z0)
+            b = d2 * scale * inverse
             if code == 1 or code == 3:
                 d0 = d0 + h
             elif code == 5:
@@ -126,7 +131,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
             ws[row + stride] = ws[row + stride] - b * second
             ws[row + 2 * stride] = ws[row + 2 * stride] - b * along
             if code == k + 1:
-                ws[row + 2 * stride] = ws[row + 2 * stride] - scale / f
+                ws[row + 2 * stride] = ws[row + 2 * stride] - scale * wide
             # -nu δ × e
             ws[row + 3 * stride] = ws[row + 3 * stride] + scale * (d1 * along - d2 * second)
             ws[row + 4 * stride] = ws[row + 4 * stride] + scale * (d2 * first - d0 * along)
@@ -155,11 +160,9 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
             # Half the second derivative of u_k along its own axis: -T_Z d(1/Z) + (Ω × e_Z)_k / f, where T = N - Ω × X0
             # - ε X0 is the velocity that the patch's motion has at the camera; along the other axis it vanishes.
             f, moment = value[p.v + Value.F], value[p.v + Value.SECOND_MOMENT + k]
-            Z0, c = ws[patch + Patch.DEPTH * stride], ws[patch + Patch.C * stride]
-            # bend Z0 = moment slope / (f c)
-            bent = ws[patch + (Patch.SLOPE_X + k) * stride] / c * (moment / f)
             turned = moment / f
-            ws[row + 2 * stride] = ws[row + 2 * stride] + bent / Z0
+            bent = ws[patch + (Patch.SLOPE_X + k) * stride] * ws[patch + Patch.INVERSE_C * stride] * turned
+            ws[row + 2 * stride] = ws[row + 2 * stride] + bent * ws[patch + Patch.INVERSE_DEPTH * stride]
             about_x = bent * ws[patch + Patch.Y * stride] + ti.select(k == 1, turned, precise(0.0))
             ws[row + 3 * stride] = ws[row + 3 * stride] - about_x
             about_y = bent * ws[patch + Patch.X * stride] + ti.select(k == 0, turned, precise(0.0))
@@ -171,8 +174,8 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         """Coefficients of the range constraint ``b_t`` (5.23)."""
         row, patch, stride = region(p, number, Region.ROW), region(p, number, Region.PATCH), p.stride
         small.clear(ws, row, MAX_UNKNOWNS, stride)
-        Z0 = ws[patch + Patch.DEPTH * stride]
-        scale = V(value[p.v + Value.F]) / (Z0 * Z0 * ws[patch + Patch.C * stride])
+        inverse = ws[patch + Patch.INVERSE_DEPTH * stride]
+        scale = inverse * inverse * ws[patch + Patch.INVERSE_C * stride] * value[p.v + Value.F]
         ws[row] = 0.0 - scale * ws[patch + Patch.SLOPE_X * stride]
         ws[row + stride] = 0.0 - scale * ws[patch + Patch.SLOPE_Y * stride]
         ws[row + 2 * stride] = scale

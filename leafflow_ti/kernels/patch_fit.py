@@ -17,15 +17,15 @@ from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.texture import texture_function
 from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value
 
-START, CLEAR, FINISH, DIFFERENCES = 1, 2, 4, 8
+START, CLEAR, FINISH, COVARIANCE, DIFFERENCES = 1, 2, 4, 8, 16
 """What a step does besides adding its rows: forget the motion, forget the sums (both before), solve (after), find the
-covariances of difference quotients (in every step of a fit, or in none)."""
+covariance, and those of difference quotients (these in every step of a fit, or in none)."""
 
 
 @functools.cache
 def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stage ``patch_fit``: adds a set of rows to the sums, and solves for the motion and its covariance with the
-    last one. Its ``which`` is a sum of ``START``, ``CLEAR``, ``DIFFERENCES`` and ``FINISH``."""
+    last one. Its ``which`` is a sum of the above."""
     precise, V = spec.precise, spec.element
     small, patch, smoothness = dense(spec), patch_functions(spec), texture_function(spec)
 
@@ -67,7 +67,7 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
             turn = motion + 3 * p.stride
             ZX, ZY = ws[at + Patch.SLOPE_X * p.stride], ws[at + Patch.SLOPE_Y * p.stride]
             turning = ti.sqrt(small.dot(ws, turn, 1, turn, 1, 3, p.stride) * (ZX * ZX + ZY * ZY + 1.0))
-            result = result + turning * factor / small.magnitude(ws[at + Patch.DEPTH * p.stride])
+            result = result + turning * small.magnitude(ws[at + Patch.INVERSE_DEPTH * p.stride]) * factor
         return result
 
     @ti.func
@@ -94,9 +94,11 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
             ws[derivative + (2 * offsets * terms + number[p.n + Number.RANGE_TERM]) * p.stride] = V(1.0)
         for variant in range(1 + ti.min(terms, 3)):
             # Like a derivative of the disparity, b counts per pixel.
-            h = small.magnitude(nu) * value[p.v + Value.STEP_SIZE]
+            step = value[p.v + Value.STEP_SIZE]
             if variant > 1:
-                h = h / value[p.v + Value.F]
+                step /= value[p.v + Value.F]
+            h = small.magnitude(nu) * step
+            inverse = 1.0 / h
             patch.place_patch(
                 nu + h * ti.cast(variant == 1, precise), b1 + h * ti.cast(variant == 2, precise),
                 b2 + h * ti.cast(variant == 3, precise), p, number, value, ws,
@@ -114,7 +116,7 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
                     ws[found + r * p.stride] = result
                 else:
                     here = derivative + (r * terms + variant - 1) * p.stride
-                    ws[here] = ws[here] - (result - ws[found + r * p.stride]) / h
+                    ws[here] = ws[here] - (result - ws[found + r * p.stride]) * inverse
         measure(n_rows, p, number, value, ws)
 
     @ti.func
@@ -215,24 +217,30 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
                 ws[at + e * p.stride] = ws[at + e * p.stride] * factor
 
     @ti.func
-    def accumulate(n_rows: ti.i32, variant: ti.i32, p: ti.template(), number: ti.template(), ws: ti.template()):
-        """Add the rows to the normal equations (variant 0) and to what the covariance of a variant is made of."""
+    def accumulate(
+        n_rows: ti.i32, first: ti.i32, last: ti.i32, variant: ti.i32, p: ti.template(), number: ti.template(),
+        ws: ti.template(),
+    ):  # fmt: skip
+        """Add the rows to the normal equations (parts 0, 1) and to what the covariance of a variant is made of (2, 3).
+
+        Of symmetric sums the lower triangle.
+        """
         n, terms = number[p.n + Number.UNKNOWNS], number[p.n + Number.TERMS]
         weighted, work = region(p, number, Region.WEIGHTED), region(p, number, Region.MOTION_WORK)
-        small.symmetric_times(ws, region(p, number, Region.OWN), weighted, work, n_rows, n, p.stride)
-        for part in range(ti.select(variant == 0, 4, 2)):
-            x, rows = work, n
-            target = region(p, number, Region.NORMAL_SPREAD) + variant * n * n * p.stride
+        if last > 2:
+            small.symmetric_times(ws, region(p, number, Region.OWN), weighted, work, n_rows, n, p.stride)
+        for part in range(first, last):
+            x, rows, target = region(p, number, Region.DESIGN), n, region(p, number, Region.NORMAL)
             if part == 1:
+                x, rows, target = region(p, number, Region.VALUE), 1, region(p, number, Region.NORMAL_RHS)
+            elif part == 2:
+                x, target = work, region(p, number, Region.NORMAL_SPREAD) + variant * n * n * p.stride
+            elif part == 3:
                 x, rows = region(p, number, Region.DERIVATIVE), terms
                 target = region(p, number, Region.LEFT)
                 target += variant * (terms + number[p.n + Number.CORRELATED]) * n * p.stride
-            elif part == 2:
-                x, target = region(p, number, Region.DESIGN), region(p, number, Region.NORMAL)
-            elif part == 3:
-                x, rows, target = region(p, number, Region.VALUE), 1, region(p, number, Region.NORMAL_RHS)
             for r in range(rows):
-                for c in range(n):
+                for c in range(ti.select(part % 2 == 0, r + 1, n)):
                     at = target + (r * n + c) * p.stride
                     one, two = x + r * p.stride, weighted + c * p.stride
                     ws[at] = ws[at] + small.dot(ws, one, rows, two, n, n_rows, p.stride)
@@ -302,13 +310,14 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
                     half = small.dot(ws, cov_g + a * terms * p.stride, 1, left + c * p.stride, n, terms, p.stride)
                     ws[at] = ws[at] + half * precise(0.5)
             for r in range(n):
-                for c in range(n):
+                for c in range(r + 1):
                     total = ws[spread + (r * n + c) * p.stride]
                     for k in range(count):
                         one, two = k * n + r, k * n + c
                         total = total + ws[left + one * p.stride] * ws[right + two * p.stride]
                         total = total + ws[left + two * p.stride] * ws[right + one * p.stride]
                     ws[cov + (r * n + c) * p.stride] = total
+                    ws[cov + (c * n + r) * p.stride] = total
             small.sandwich(ws, normal, cov, n, 2, p.stride)
 
     @ti.func
@@ -328,12 +337,13 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
         if number[p.n + Number.OWN_FLOW] == 1:
             leave_out(n_rows, p, number, value, ws)
         weigh(n_rows, p, number, ws)
-        variants = ti.select(p.which & DIFFERENCES != 0, 3, 1)
-        for variant in range(variants):
+        variants = ti.select(p.which & DIFFERENCES != 0, 3, ti.select(p.which & COVARIANCE != 0, 1, 0))
+        for variant in range(ti.max(variants, 1)):
             if variant > 0:
                 difference(n_rows, variant - 1, p, number, value, ws)
-            accumulate(n_rows, variant, p, number, ws)
-            correlate(variant, p, number, value, ws)
+            accumulate(n_rows, ti.select(variant == 0, 0, 2), ti.select(variants == 0, 2, 4), variant, p, number, ws)
+            if variants > 0:
+                correlate(variant, p, number, value, ws)
         if p.which & FINISH != 0:
             finish(variants, p, number, ws)
 

@@ -349,7 +349,7 @@ class EstimateStage:
 
     def _make_steps(self) -> list[_Step]:
         """What is done to every group of pixels."""
-        from leafflow_ti.kernels.patch_fit import CLEAR, DIFFERENCES, FINISH, START
+        from leafflow_ti.kernels.patch_fit import CLEAR, COVARIANCE, DIFFERENCES, FINISH, START
         from leafflow_ti.kernels.stages import Stage
 
         problem, own = self.problem, self.problem.own_flows
@@ -363,7 +363,7 @@ class EstimateStage:
                 add(stage, tables=tables + self._raw if raw else tables)
             add(Stage.CLEAN, tables=tables)
 
-        differences = DIFFERENCES if self.differences else 0
+        errors = COVARIANCE | (DIFFERENCES if self.differences else 0)
         solve(0)
         if "t" in problem.columns.solutions:
             add(Stage.ROW_COVARIANCE, problem.columns.n_time_like - 1)
@@ -377,17 +377,17 @@ class EstimateStage:
         elif problem.fitted:
             for i in range(problem.passes):
                 last = i == problem.passes - 1 and not own
-                add(Stage.PATCH_FIT, (START if i == 0 else CLEAR) | FINISH | (differences if last else 0))
+                add(Stage.PATCH_FIT, (START if i == 0 else CLEAR) | FINISH | (errors if last else 0))
         add(Stage.MEASURED)
         if own:
             if own.reference_rows:
-                add(Stage.PATCH_FIT, CLEAR | differences, 1)
+                add(Stage.PATCH_FIT, CLEAR | errors, 1)
             for i in range(len(own.steps)):
                 solve(2 + i)
                 add(Stage.ROW_COVARIANCE, 0, 2 + i)
                 clear = CLEAR if i == 0 and not own.reference_rows else 0
                 finish = FINISH if i == len(own.steps) - 1 else 0
-                add(Stage.PATCH_FIT, clear | differences | finish, 2 + i)
+                add(Stage.PATCH_FIT, clear | errors | finish, 2 + i)
         if problem.unknowns:
             add(Stage.MOTION, tables=1 if own else 0)
         add(Stage.EMIT)
