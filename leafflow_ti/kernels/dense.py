@@ -69,6 +69,7 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         """``X := (L L^T)^-1 X`` for the factor at ``l`` and X [n, m] at ``x``.
 
         Forward and backward substitution are one loop over both directions: inlined code is compiled once per call.
+        Here and below columns go in pairs (an odd last one twice): two sums at a time hide each other's latency.
         """
         for backward in range(2):
             for step in range(n):
@@ -76,14 +77,18 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                 first = ti.select(backward == 1, r + 1, 0)
                 begin = ti.select(backward == 1, tri(r + 1, r), tri(r, 0))
                 inverse = ws[l + tri(r, r) * stride]
-                for c in range(m):
-                    at = x + (r * m + c) * stride
-                    total = ws[at]
-                    one = begin  # along row r of the factor, or down its column r
+                for pair in range((m + 1) // 2):
+                    here = x + (r * m + 2 * pair) * stride
+                    beside = ti.select(2 * pair + 1 < m, stride, 0)
+                    one, two = ws[here], ws[here + beside]
+                    place = begin  # along row r of the factor, or down its column r
                     for k in range(first, first + step):
-                        total = total - ws[l + one * stride] * ws[x + (k * m + c) * stride]
-                        one += ti.select(backward == 1, k + 1, 1)
-                    ws[at] = total * inverse
+                        factor, at = ws[l + place * stride], x + (k * m + 2 * pair) * stride
+                        one = one - factor * ws[at]
+                        two = two - factor * ws[at + beside]
+                        place += ti.select(backward == 1, k + 1, 1)
+                    ws[here] = one * inverse
+                    ws[here + beside] = two * inverse
 
     @ti.func
     def sandwich(ws: ti.template(), l: ti.i32, x: ti.i32, n: ti.i32, times: ti.i32, stride: ti.i32):
@@ -114,13 +119,38 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
     def symmetric_times(ws: ti.template(), a: ti.i32, x: ti.i32, y: ti.i32, n: ti.i32, m: ti.i32, stride: ti.i32):
         """``Y := A X`` for the packed symmetric matrix at ``a``, X and Y [n, m]."""
         for r in range(n):
-            for c in range(m):
-                total = V(0.0)
-                one = tri(r, 0)  # along row r up to the diagonal, then down column r
+            for pair in range((m + 1) // 2):
+                beside = ti.select(2 * pair + 1 < m, stride, 0)
+                one, two = V(0.0), V(0.0)
+                place = tri(r, 0)  # along row r up to the diagonal, then down column r
                 for k in range(n):
-                    total = total + ws[a + one * stride] * ws[x + (k * m + c) * stride]
-                    one += ti.select(k < r, 1, k + 1)
-                ws[y + (r * m + c) * stride] = total
+                    factor, at = ws[a + place * stride], x + (k * m + 2 * pair) * stride
+                    one = one + factor * ws[at]
+                    two = two + factor * ws[at + beside]
+                    place += ti.select(k < r, 1, k + 1)
+                here = y + (r * m + 2 * pair) * stride
+                ws[here] = one
+                ws[here + beside] = two
+
+    @ti.func
+    def add_product(
+        ws: ti.template(), x: ti.i32, rows: ti.i32, y: ti.i32, cols: ti.i32, n: ti.i32, lower: ti.i32, z: ti.i32,
+        stride: ti.i32,
+    ):  # fmt: skip
+        """``Z += X^T Y`` for X [n, rows], Y [n, cols], Z [rows, cols]; ``lower``: Z is symmetric, to its diagonal."""
+        for r in range(rows):
+            used = ti.select(lower == 1, r + 1, cols)
+            for pair in range((used + 1) // 2):
+                beside = ti.select(2 * pair + 1 < cols, stride, 0)
+                one, two = V(0.0), V(0.0)
+                for k in range(n):
+                    factor, at = ws[x + (k * rows + r) * stride], y + (k * cols + 2 * pair) * stride
+                    one = one + factor * ws[at]
+                    two = two + factor * ws[at + beside]
+                here = z + (r * cols + 2 * pair) * stride
+                ws[here] = ws[here] + one
+                if beside > 0:
+                    ws[here + stride] = ws[here + stride] + two
 
     @ti.func
     def dot(ws: ti.template(), x: ti.i32, xstep: ti.i32, y: ti.i32, ystep: ti.i32, n: ti.i32, stride: ti.i32):
@@ -228,6 +258,7 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         solve=solve,
         upper_times=upper_times,
         symmetric_times=symmetric_times,
+        add_product=add_product,
         dot=dot,
         jacobi=jacobi,
     )

@@ -239,11 +239,7 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
                 x, rows = region(p, number, Region.DERIVATIVE), terms
                 target = region(p, number, Region.LEFT)
                 target += variant * (terms + number[p.n + Number.CORRELATED]) * n * p.stride
-            for r in range(rows):
-                for c in range(ti.select(part % 2 == 0, r + 1, n)):
-                    at = target + (r * n + c) * p.stride
-                    one, two = x + r * p.stride, weighted + c * p.stride
-                    ws[at] = ws[at] + small.dot(ws, one, rows, two, n, n_rows, p.stride)
+            small.add_product(ws, x, rows, weighted, n, n_rows, ti.cast(part % 2 == 0, ti.i32), target, p.stride)
 
     @ti.func
     def correlate(variant: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):

@@ -45,7 +45,7 @@ class Problem:
     fitted: int = 0
     own_flows: OwnFlows | None = None
     passes: int = 2
-    iterations: int = 2
+    iterations: int = 4
     range_scale: tuple[float, float] | None = None
 
     @property
