@@ -135,9 +135,9 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
     @ti.func
     def add_product(
         ws: ti.template(), x: ti.i32, rows: ti.i32, y: ti.i32, cols: ti.i32, n: ti.i32, lower: ti.i32, z: ti.i32,
-        stride: ti.i32,
+        scale: ti.template(), stride: ti.i32,
     ):  # fmt: skip
-        """``Z += X^T Y`` for X [n, rows], Y [n, cols], Z [rows, cols]; ``lower``: Z is symmetric, to its diagonal."""
+        """``Z += scale X^T Y`` for X [n, rows], Y [n, cols], Z [rows, cols]; ``lower``: Z is symmetric, to its diagonal."""
         for r in range(rows):
             used = ti.select(lower == 1, r + 1, cols)
             for pair in range((used + 1) // 2):
@@ -148,9 +148,9 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
                     one = one + factor * ws[at]
                     two = two + factor * ws[at + beside]
                 here = z + (r * cols + 2 * pair) * stride
-                ws[here] = ws[here] + one
+                ws[here] = ws[here] + one * scale
                 if beside > 0:
-                    ws[here + stride] = ws[here + stride] + two
+                    ws[here + stride] = ws[here + stride] + two * scale
 
     @ti.func
     def dot(ws: ti.template(), x: ti.i32, xstep: ti.i32, y: ti.i32, ystep: ti.i32, n: ti.i32, stride: ti.i32):

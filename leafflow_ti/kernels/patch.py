@@ -80,98 +80,97 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         ws[patch + Patch.INVERSE_C * p.stride] = 1.0 / (1.0 - ZX * x - ZY * y)
 
     @ti.func
-    def add_row(
-        k: ti.i32, code: ti.i32, factor: precise, p: ti.template(), number: ti.template(), value: ti.template(),
-        ws: ti.template(),
-    ):  # fmt: skip
-        """Add ``factor`` times the coefficients of (N, Ω, A, ε) in ``a_k,m`` (5.18) to the row; codes 0 = the motion
-        itself, 1.. = x, y, sx, sy, t.
+    def motion_row(
+        k: ti.i32, code: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
+    ):
+        """Coefficients of (N, Ω, A, ε) in ``a_k,m`` (5.18), as the window and the preshifted data measure it, per camera
+        step along s: to ROW; what they give for the present motion. Codes 0 = the motion itself, 1.. = x, y, sx, sy, t.
 
         With h = Z0/f for x, y and 1 for the others, and g the slope (for t: Zt), every world derivative of (5.8) is
         ``h g/c (x, y, f)/f + h (unit vector along its axis)``, and every b is ``h g f / (Z0² c)``.
         """
-        row, patch = region(p, number, Region.ROW), region(p, number, Region.PATCH)
-        motion = region(p, number, Region.MOTION)
+        patch, motion = region(p, number, Region.PATCH), region(p, number, Region.MOTION)
         f, stride = value[p.v + Value.F], p.stride
-        x, y = ws[patch + Patch.X * stride], ws[patch + Patch.Y * stride]
-        inverse = ws[patch + Patch.INVERSE_DEPTH * stride]
         wide = precise(1.0) / f
+        x, y = ws[patch + Patch.X * stride], ws[patch + Patch.Y * stride]
+        inverse, inverse_c = ws[patch + Patch.INVERSE_DEPTH * stride], ws[patch + Patch.INVERSE_C * stride]
+        ZX, ZY = ws[patch + Patch.SLOPE_X * stride], ws[patch + Patch.SLOPE_Y * stride]
+        N0, N1, N2 = ws[motion], ws[motion + stride], ws[motion + 2 * stride]
         # e_k = (1, 0, -x) or (0, 1, -y)
         second = ti.cast(k, precise)
         first = 1.0 - second
         along = 0.0 - (x * first + y * second)
-        scale = inverse * (factor * f)  # -factor nu
-        if code == 0:
-            ws[row] = ws[row] + scale * first
-            ws[row + stride] = ws[row + stride] + scale * second
-            ws[row + 2 * stride] = ws[row + 2 * stride] + scale * along
-        else:
-            ZX, ZY = ws[patch + Patch.SLOPE_X * stride], ws[patch + Patch.SLOPE_Y * stride]
-            slope, h = ZX, V(1.0)
-            if code == 2 or code == 4:
-                slope = ZY
-            if code < 3:
-                h = ws[patch + Patch.DEPTH * stride] * wide
-            N0, N1, N2 = ws[motion], ws[motion + stride], ws[motion + 2 * stride]
-            if code == 5:
-                slope = N2 - ZX * N0 - ZY * N1
-            d2 = h * slope * ws[patch + Patch.INVERSE_C * stride]
-            d0 = d2 * x
-            d1 = d2 * y
-            b = d2 * scale * inverse
-            if code == 1 or code == 3:
-                d0 = d0 + h
-            elif code == 5:
-                d0 = d0 - N0
-                d1 = d1 - N1
-                d2 = d2 - N2
-            else:
-                d1 = d1 + h
-            ws[row] = ws[row] - b * first
-            ws[row + stride] = ws[row + stride] - b * second
-            ws[row + 2 * stride] = ws[row + 2 * stride] - b * along
-            if code == k + 1:
-                ws[row + 2 * stride] = ws[row + 2 * stride] - scale * wide
-            # -nu δ × e
-            ws[row + 3 * stride] = ws[row + 3 * stride] + scale * (d1 * along - d2 * second)
-            ws[row + 4 * stride] = ws[row + 4 * stride] + scale * (d2 * first - d0 * along)
-            ws[row + 5 * stride] = ws[row + 5 * stride] + scale * (d0 * second - d1 * first)
-            if code == 5:
-                ws[row + 6 * stride] = ws[row + 6 * stride] + scale * first
-                ws[row + 7 * stride] = ws[row + 7 * stride] + scale * second
-                ws[row + 8 * stride] = ws[row + 8 * stride] + scale * along
-            grown = d0 * first + d1 * second + d2 * along
-            ws[row + GROWTH * stride] = ws[row + GROWTH * stride] + scale * grown
-
-    @ti.func
-    def motion_row(
-        k: ti.i32, code: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
-    ):
-        """The row as the window and the preshifted data measure it, per camera step along s."""
-        row, patch, stride = region(p, number, Region.ROW), region(p, number, Region.PATCH), p.stride
-        small.clear(ws, row, MAX_UNKNOWNS, stride)
+        n0, n1, n2, r0, r1, r2, grown = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+        scale = V(0.0)
         along_s = code == 3 or code == 4
         for part in range(ti.select(along_s, 2, 1)):
-            factor = precise(1.0)
+            axis, factor = code, f
             if along_s:
-                factor = value[p.v + ti.select(part == 0, Value.BASELINE, Value.SHIFT) + code - 3]
-            add_row(k, ti.select(part == 0, code, code - 2), factor, p, number, value, ws)
-        if code == 0:
-            # Half the second derivative of u_k along its own axis: -T_Z d(1/Z) + (Ω × e_Z)_k / f, where T = N - Ω × X0
-            # - ε X0 is the velocity that the patch's motion has at the camera; along the other axis it vanishes.
-            f, moment = value[p.v + Value.F], value[p.v + Value.SECOND_MOMENT + k]
-            turned = moment / f
-            bent = ws[patch + (Patch.SLOPE_X + k) * stride] * ws[patch + Patch.INVERSE_C * stride] * turned
-            ws[row + 2 * stride] = ws[row + 2 * stride] + bent * ws[patch + Patch.INVERSE_DEPTH * stride]
-            about_x = bent * ws[patch + Patch.Y * stride] + ti.select(k == 1, turned, precise(0.0))
-            ws[row + 3 * stride] = ws[row + 3 * stride] - about_x
-            about_y = bent * ws[patch + Patch.X * stride] + ti.select(k == 0, turned, precise(0.0))
-            ws[row + 4 * stride] = ws[row + 4 * stride] + about_y
-            ws[row + GROWTH * stride] = ws[row + GROWTH * stride] - bent
+                factor *= value[p.v + ti.select(part == 0, Value.BASELINE, Value.SHIFT) + code - 3]
+                axis = ti.select(part == 0, code, code - 2)
+            scale = inverse * factor  # -nu, times what the part counts
+            if axis == 0:
+                # Half the second derivative of u_k along its own axis: -T_Z d(1/Z) + (Ω × e_Z)_k / f, where
+                # T = N - Ω × X0 - ε X0 is the velocity that the patch's motion has at the camera; along the other axis
+                # it vanishes.
+                turned = value[p.v + Value.SECOND_MOMENT + k] * wide
+                bent = (ZX * first + ZY * second) * inverse_c * turned
+                n0 = scale * first
+                n1 = scale * second
+                n2 = scale * along + bent * inverse
+                r0 = 0.0 - (bent * y + turned * second)
+                r1 = bent * x + turned * first
+                grown = 0.0 - bent
+            else:
+                slope, h = ZX, V(1.0)
+                if axis == 2 or axis == 4:
+                    slope = ZY
+                if axis < 3:
+                    h = ws[patch + Patch.DEPTH * stride] * wide
+                if axis == 5:
+                    slope = N2 - ZX * N0 - ZY * N1
+                d2 = h * slope * inverse_c
+                d0 = d2 * x
+                d1 = d2 * y
+                b = d2 * scale * inverse
+                if axis == 1 or axis == 3:
+                    d0 = d0 + h
+                elif axis == 5:
+                    d0 = d0 - N0
+                    d1 = d1 - N1
+                    d2 = d2 - N2
+                else:
+                    d1 = d1 + h
+                n0 = n0 - b * first
+                n1 = n1 - b * second
+                n2 = n2 - b * along
+                if axis == k + 1:
+                    n2 = n2 - scale * wide
+                # -nu δ × e
+                r0 = r0 + scale * (d1 * along - d2 * second)
+                r1 = r1 + scale * (d2 * first - d0 * along)
+                r2 = r2 + scale * (d0 * second - d1 * first)
+                grown = grown + scale * (d0 * first + d1 * second + d2 * along)
+        row = region(p, number, Region.ROW)
+        ws[row] = n0
+        ws[row + stride] = n1
+        ws[row + 2 * stride] = n2
+        ws[row + 3 * stride] = r0
+        ws[row + 4 * stride] = r1
+        ws[row + 5 * stride] = r2
+        ws[row + GROWTH * stride] = grown
+        result = n0 * N0 + n1 * N1 + n2 * N2 + grown * ws[motion + GROWTH * stride]
+        result = result + r0 * ws[motion + 3 * stride] + r1 * ws[motion + 4 * stride] + r2 * ws[motion + 5 * stride]
+        accelerated = scale * ti.cast(code == 5, precise)
+        a0, a1, a2 = ws[motion + 6 * stride], ws[motion + 7 * stride], ws[motion + 8 * stride]
+        ws[row + 6 * stride] = accelerated * first
+        ws[row + 7 * stride] = accelerated * second
+        ws[row + 8 * stride] = accelerated * along
+        return result + accelerated * (a0 * first + a1 * second + a2 * along)
 
     @ti.func
     def range_row(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
-        """Coefficients of the range constraint ``b_t`` (5.23)."""
+        """Coefficients of the range constraint ``b_t`` (5.23): to ROW; what they give for the present motion."""
         row, patch, stride = region(p, number, Region.ROW), region(p, number, Region.PATCH), p.stride
         small.clear(ws, row, MAX_UNKNOWNS, stride)
         inverse = ws[patch + Patch.INVERSE_DEPTH * stride]
@@ -179,5 +178,6 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         ws[row] = 0.0 - scale * ws[patch + Patch.SLOPE_X * stride]
         ws[row + stride] = 0.0 - scale * ws[patch + Patch.SLOPE_Y * stride]
         ws[row + 2 * stride] = scale
+        return small.dot(ws, row, 1, region(p, number, Region.MOTION), 1, 3, stride)
 
     return SimpleNamespace(pixel_ray=pixel_ray, place_patch=place_patch, motion_row=motion_row, range_row=range_row)

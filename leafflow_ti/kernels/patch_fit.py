@@ -42,13 +42,12 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
     def make_row(r: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Leave the coefficients of equation ``r`` in ROW; what they give for the present motion."""
         code, offsets = code_of(r, p, number), number[p.n + Number.OFFSETS]
+        result = V(0.0)
         if code == RANGE_CODE:
-            patch.range_row(p, number, value, ws)
+            result = patch.range_row(p, number, value, ws)
         else:
-            patch.motion_row(r // offsets, code, p, number, value, ws)
-        return small.dot(
-            ws, region(p, number, Region.ROW), 1, region(p, number, Region.MOTION), 1, MAX_UNKNOWNS, p.stride
-        )
+            result = patch.motion_row(r // offsets, code, p, number, value, ws)
+        return result
 
     @ti.func
     def equation_error(r: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
@@ -239,7 +238,8 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
                 x, rows = region(p, number, Region.DERIVATIVE), terms
                 target = region(p, number, Region.LEFT)
                 target += variant * (terms + number[p.n + Number.CORRELATED]) * n * p.stride
-            small.add_product(ws, x, rows, weighted, n, n_rows, ti.cast(part % 2 == 0, ti.i32), target, p.stride)
+            lower = ti.cast(part % 2 == 0, ti.i32)
+            small.add_product(ws, x, rows, weighted, n, n_rows, lower, target, V(1.0), p.stride)
 
     @ti.func
     def correlate(variant: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
@@ -272,9 +272,7 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
                 x = region(p, number, Region.PRODUCT) + ti.max(partner, 0) * rows_t * p.stride
                 scale = factor * value[p.v + Value.PARTNER + a - terms]
             if shared:
-                for c in range(n):
-                    term = small.dot(ws, x, 1, weighted + c * p.stride, n, used, p.stride)
-                    ws[at + c * p.stride] = ws[at + c * p.stride] + term * scale
+                small.add_product(ws, x, 1, weighted, n, used, 0, at, scale, p.stride)
 
     @ti.func
     def finish(variants: ti.i32, p: ti.template(), number: ti.template(), ws: ti.template()):
