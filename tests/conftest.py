@@ -291,8 +291,8 @@ class Bench:
 
     def _region(self, stage: EstimateStage, region: int, size: int) -> np.ndarray:
         """A region of the workspace, [rows, cols, size]."""
-        lanes, pixels = self.device.dense.lanes, self.band.rows * stage.view.pitch
-        groups, n, first = pixels // lanes, stage.layout.n_elements, stage.layout.offsets[region]
+        lanes, groups = self.device.dense.lanes, self.band.rows * stage._row_groups
+        pixels, n, first = groups * lanes, stage.layout.n_elements, stage.layout.offsets[region]
         assert stage._groups >= groups, "the block is too large to be one batch"
         workspace = np.array(self.device.host(stage._workspace))[: n * pixels]
         # On the CPU the lanes of a group are neighbours, on a GPU the groups are: see kernels/dense.py.

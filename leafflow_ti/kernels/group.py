@@ -37,7 +37,7 @@ def region(p: ti.template(), number: ti.template(), name: ti.template()) -> ti.i
 def group_kernel(spec: KernelSpec, stages: tuple):
     """A kernel: the stages ``(p, number, value, ws, J, out)`` that the steps name, for every group of a batch.
 
-    A step's stage counts in ``stages``; with a single stage it does not matter. Group g of a task works at
+    ``row_groups`` groups cover a row of the output, ``pitch`` pixels are stored of it. A step's stage counts in ``stages``; with a single stage it does not matter. Group g of a task works at
     ``task task_step + g group_step`` of the workspace.
     """
     real, precise, lanes, element = spec.real, spec.precise, spec.lanes, spec.element
@@ -61,12 +61,20 @@ def group_kernel(spec: KernelSpec, stages: tuple):
                     if code == index:
                         stages[index](p, number, value, ws, J, out)
 
+    @ti.func
+    def pixel_of(group: ti.i32, row_groups: ti.i32, pitch: ti.i32) -> ti.i32:
+        """First pixel of a group: groups lie side by side in the rows of the output."""
+        row = group // row_groups
+        return row * pitch + (group - row * row_groups) * lanes
+
     @lane_kernel(lanes)
     def groups(
         first_group: ti.i32,
         n_groups: ti.i32,
         task_step: ti.i32,
         group_step: ti.i32,
+        row_groups: ti.i32,
+        pitch: ti.i32,
         n_pixels: ti.i32,
         first_step: ti.i32,
         last_step: ti.i32,
@@ -81,7 +89,7 @@ def group_kernel(spec: KernelSpec, stages: tuple):
         if ti.static(spec.gpu):
             for g in range(n_groups):
                 run_steps(
-                    g, n_groups, first_group + g, n_pixels, first_step, last_step,
+                    g, n_groups, pixel_of(first_group + g, row_groups, pitch), n_pixels, first_step, last_step,
                     steps_in, number_in, value_in, J_in, ws_io, map_out,
                 )  # fmt: skip
         else:
@@ -89,8 +97,8 @@ def group_kernel(spec: KernelSpec, stages: tuple):
                 if part == 0:
                     for g in range(task * n_groups // n_tasks, (task + 1) * n_groups // n_tasks):
                         run_steps(
-                            task * task_step + g * group_step, 1, (first_group + g) * lanes, n_pixels, first_step,
-                            last_step, steps_in, number_in, value_in, J_in, ws_io, map_out,
+                            task * task_step + g * group_step, 1, pixel_of(first_group + g, row_groups, pitch),
+                            n_pixels, first_step, last_step, steps_in, number_in, value_in, J_in, ws_io, map_out,
                         )  # fmt: skip
 
     return groups

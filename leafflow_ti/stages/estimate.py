@@ -156,9 +156,10 @@ class EstimateStage:
         self._steps = self._make_steps()
         self.set_view(view)
         lanes, n_pixels = device.dense.lanes, view.rows * view.pitch
+        self._row_groups = -(-view.cols // lanes)
         itemsize = np.dtype(device.real("algebra")).itemsize
         per_group = self.layout.n_elements * lanes * itemsize
-        groups = n_pixels // lanes
+        groups = view.rows * self._row_groups
         self._tasks = TASKS_PER_THREAD * device.threads
         if device.gpu:
             self._groups = min(groups, GPU_GROUPS)
@@ -419,12 +420,13 @@ class EstimateStage:
         tensors = self._together([tensor, *own_tensors], n_pixels)
         workspace = device.vectors(self._workspace, lanes)
         task_step, group_step = (0, self.layout.n_elements) if self.apart else (self.layout.n_elements, 0)
-        for first in range(0, n_pixels // lanes, self._groups):
-            groups = min(self._groups, n_pixels // lanes - first)
+        n_groups = view.rows * self._row_groups
+        for first in range(0, n_groups, self._groups):
+            groups = min(self._groups, n_groups - first)
             for kernel, begin, end, _ in self._launches():
                 kernel(
-                    first, groups, task_step, group_step, n_pixels, begin, end, min(groups, self._tasks),
-                    *self._on_device, tensors, workspace, self._maps,
+                    first, groups, task_step, group_step, self._row_groups, view.pitch, n_pixels, begin, end,
+                    min(groups, self._tasks), *self._on_device, tensors, workspace, self._maps,
                 )  # fmt: skip
         planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)
         result: NDArray[Any] = planes[:, :, : view.cols]
