@@ -33,6 +33,8 @@ CHUNK_GROUPS = 2048
 """Groups of a launch on the CPU: some tenths of a second, so that an interrupt is noticed."""
 TASKS_PER_THREAD = 4
 RIDGE = {"f64": 1e-13, "f32": 1e-7}
+GUARDED = {1: 2, 2: 4, 3: 4}
+"""Vectors that the inverse iteration carries for so many solutions; the guards are what makes it converge."""
 GAP = {"f64": 1e-6, "f32": 1e-3}
 DENOISE = {"ols": 0.0, "tls": 0.0, "tls-equilibrated": 0.9}
 """Share of the gradients' own noise that the covariances take out of J_ff; OLS divides by J_ff as it is, and the
@@ -210,7 +212,7 @@ class EstimateStage:
     ) -> _Tables:
         """What the tables of every data vector hold: columns, noise, the motion rows."""
         from leafflow_ti.kernels.patch import RANGE_CODE
-        from leafflow_ti.kernels.workspace import BLOCK, Number, Region, Value
+        from leafflow_ti.kernels.workspace import Number, Region, Value
 
         problem, precision = self.problem, self.device.algebra
         noise = column_noise(sampling, columns)
@@ -220,7 +222,7 @@ class EstimateStage:
         number[: len(Region)] = self.layout.offsets
         self._set_numbers(
             number, N=columns.n, SOLUTIONS=columns.n_time_like, FLOW=columns.n_flow, ITERATIONS=problem.iterations,
-            BLOCK=min(BLOCK, columns.n_time_like + 2), FIRST_PLANE=0,
+            BLOCK=GUARDED[columns.n_time_like], FIRST_PLANE=0,
             MOTION_SOLUTION=columns.n_time_like - 1 if "t" in columns.solutions else -1, TERMS=len(problem.terms),
             OFFSETS=len(offsets), ROWS_T=len(rows), ROWS_S=0, USE_RANGE=0, UNKNOWNS=0, WEIGHTED=problem.weighted,
             BRIGHTNESS_COLUMN=-1, BRIGHTNESS_ROWS=0, WORLD_MAPS=0, RANGE_TERM=-1, CAMERA_SOLUTIONS=0, CROSS_TERMS=0,
