@@ -7,6 +7,7 @@ import importlib
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,9 @@ import pytest
 import leafflow_ti as lf
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import RunConfig, load_config
+from leafflow_ti.models import MODELS
 from leafflow_ti.progress import Progress
+from leafflow_ti.runtime import start
 from leafflow_ti.stages.tensor import OUTPUT_PLANES
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import PlaneScene, render, truth
@@ -183,11 +186,38 @@ def test_plan_counts_every_output_plane() -> None:
     assert Output.PLANES == OUTPUT_PLANES
 
 
-def test_front_end_of_the_engine_is_left_as_it_was() -> None:
-    from leafflow_ti.kernels.engine import ENGINE, quick_front_end
+def test_the_engine_is_left_as_it_was() -> None:
+    from leafflow_ti.kernels.engine import ENGINE, LaneKernel, quick_front_end, ti
 
-    front_end = importlib.import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
-    usual = front_end.TextWrapper
+    kernels = importlib.import_module(f"{ENGINE}.lang.kernel_impl")
+    contexts = importlib.import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
+
+    def settings() -> tuple[object, ...]:
+        return kernels.getsourcelines, kernels.textwrap, contexts.ASTTransformerContext.get_pos_info
+
+    usual = settings()
     with quick_front_end():
-        assert front_end.TextWrapper is not usual
-    assert front_end.TextWrapper is usual
+        assert not any(one is other for one, other in zip(settings(), usual, strict=True))
+    assert settings() == usual
+    with pytest.raises(RuntimeError, match="stop"), quick_front_end():
+        raise RuntimeError("stop")
+    assert settings() == usual
+
+    start()
+    config = ti.lang.impl.current_cfg()
+    split = config.real_matrix_scalarize
+    whole = LaneKernel.__new__(LaneKernel)
+    whole._kernel = lambda: config.real_matrix_scalarize
+    assert whole() is False
+    assert config.real_matrix_scalarize == split
+
+
+@pytest.mark.parametrize("model", ["affine-4d", "affine-scene-flow"])
+def test_steps_launched_apart_give_the_same_bits(bench: Callable, model: str) -> None:
+    b = bench(model, "none", "line-x", "f32")
+    motion = MODELS[model].motions[0]
+    apart, together = (b.estimate(motion, apart=apart) for apart in (True, False))
+    np.testing.assert_array_equal(together.status, apart.status)
+    for name in ("disparity", "depth", "slope_x", "slope_y", "flow_x", "flow_y", *(f"velocity_{a}" for a in "xyz")):
+        for one, other in zip(together.map(name), apart.map(name), strict=True):
+            np.testing.assert_array_equal(one, other)

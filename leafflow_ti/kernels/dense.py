@@ -137,7 +137,8 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         ws: ti.template(), x: ti.i32, rows: ti.i32, y: ti.i32, cols: ti.i32, n: ti.i32, lower: ti.i32, z: ti.i32,
         scale: ti.template(), stride: ti.i32,
     ):  # fmt: skip
-        """``Z += scale X^T Y`` for X [n, rows], Y [n, cols], Z [rows, cols]; ``lower``: Z is symmetric, to its diagonal."""
+        """``Z += scale X^T Y`` for X [n, rows], Y [n, cols], Z [rows, cols]; ``lower``: of a symmetric Z the lower
+        triangle (and what stands beside it)."""
         for r in range(rows):
             used = ti.select(lower == 1, r + 1, cols)
             for pair in range((used + 1) // 2):

@@ -37,8 +37,9 @@ def region(p: ti.template(), number: ti.template(), name: ti.template()) -> ti.i
 def group_kernel(spec: KernelSpec, stages: tuple):
     """A kernel: the stages ``(p, number, value, ws, J, out)`` that the steps name, for every group of a batch.
 
-    ``row_groups`` groups cover a row of the output, ``pitch`` pixels are stored of it. A step's stage counts in ``stages``; with a single stage it does not matter. Group g of a task works at
-    ``task task_step + g group_step`` of the workspace.
+    ``row_groups`` groups cover a row of the output, ``pitch`` pixels are stored of it. A step's stage counts in
+    ``stages``; with a single stage it does not matter. Group g of a task works at ``task task_step + g group_step`` of
+    the workspace.
     """
     real, precise, lanes, element = spec.real, spec.precise, spec.lanes, spec.element
 

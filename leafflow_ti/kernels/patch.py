@@ -83,8 +83,9 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
     def motion_row(
         k: ti.i32, code: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
     ):
-        """Coefficients of (N, Ω, A, ε) in ``a_k,m`` (5.18), as the window and the preshifted data measure it, per camera
-        step along s: to ROW; what they give for the present motion. Codes 0 = the motion itself, 1.. = x, y, sx, sy, t.
+        """Coefficients of (N, Ω, A, ε) in ``a_k,m`` (5.18), as the window and the preshifted data measure it, per
+        camera step along s: to ROW; what they give for the present motion. Codes: 0 the motion itself, 1.. x, y, sx,
+        sy, t.
 
         With h = Z0/f for x, y and 1 for the others, and g the slope (for t: Zt), every world derivative of (5.8) is
         ``h g/c (x, y, f)/f + h (unit vector along its axis)``, and every b is ``h g f / (Z0² c)``.
