@@ -9,6 +9,7 @@ list the folders of groups, where a foreign entry would be reported, but never t
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,6 +28,9 @@ from leafflow_ti.status import Status
 
 FORMAT = 1
 """Version of the layout, in the attribute ``leafflow_ti_format`` by which a store is recognised."""
+
+_METADATA = "zarr.json"
+"""The group's metadata file, attributes included (Zarr v3)."""
 
 _COORDINATES: dict[str, dict[str, Any]] = {
     "t": {"long_name": "index of the reference frame", "units": "frame"},
@@ -128,8 +132,22 @@ class ResultStore:
 
     @property
     def attrs(self) -> dict[str, Any]:
-        """Attributes of the store: resolved configuration, versions, device, fingerprints, timings."""
-        return dict(self._group.attrs)
+        """Attributes of the store as they are now: resolved configuration, versions, device, fingerprints, timings."""
+        found: dict[str, Any] = json.loads((self.path / _METADATA).read_text(encoding="utf-8"))["attributes"]
+        return found
+
+    def update_attrs(self, attrs: Mapping[str, Any]) -> None:
+        """Set attributes; whoever reads meanwhile, or after a kill, finds the old ones or the new ones.
+
+        Raises RunError when the store cannot be written.
+        """
+        with _writing(self.path):
+            metadata = json.loads((self.path / _METADATA).read_text(encoding="utf-8"))
+            metadata["attributes"].update(attrs)
+            scratch = self.path / "status" / ".done" / f".{_METADATA}"
+            scratch.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
+            _flush(scratch)
+            scratch.replace(self.path / _METADATA)
 
     @property
     def interval_s(self) -> float | None:
@@ -203,15 +221,14 @@ class ResultStore:
         return Field(maps, self.read("status", t_index), self.y, self.x, self.frames[t_index], self.attrs)
 
     def finish(self, attrs: Mapping[str, Any]) -> None:
-        """Add the attributes known at the end (timings, device).
+        """Set the attributes known at the end.
 
         Raises RunError when units are missing or the store cannot be written.
         """
         missing = self.n_units - len(self.done())
         if missing:
             raise RunError(f"{self.path}: {missing} of {self.n_units} units are not done: run again with --resume")
-        with _writing(self.path):
-            self._group.update_attributes(dict(attrs))
+        self.update_attrs(attrs)
 
 
 def _open_group(path: Path) -> zarr.Group | None:

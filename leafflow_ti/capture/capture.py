@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -116,13 +117,30 @@ class Capture(ABC):
         image pixel ``(x' + nx kx, y' + ny ky)``: the integer preshift nu0 of model section 1. Outside the images: 0.
         """
         out = np.zeros((len(frames), len(rows), len(cols), y1 - y0, x1 - x0), dtype)
+        for fill in self.fills(out, frames, rows, cols, y0, x0, shift_px):
+            fill()
+        return out
+
+    def fills(
+        self,
+        out: Array,
+        frames: Sequence[int],
+        rows: Sequence[int],
+        cols: Sequence[int],
+        y0: int,
+        x0: int,
+        shift_px: tuple[int, int] = (0, 0),
+    ) -> Iterator[Callable[[], None]]:
+        """The work of ``block``, image by image, for threads to share: each call fills its image of ``out``.
+
+        ``out`` [t, sy, sx, rows, columns] is zero before; the order is that of its images.
+        """
         row0, col0 = self.reference
         for i, t in enumerate(frames):
             for j, sy in enumerate(rows):
                 for k, sx in enumerate(cols):
                     top, left = y0 + shift_px[1] * (sy - row0), x0 + shift_px[0] * (sx - col0)
-                    self._read_into(out[i, j, k], t, sy, sx, top, left)
-        return out
+                    yield partial(self._read_into, out[i, j, k], t, sy, sx, top, left)
 
     def _read_into(self, out: Array, t: int, sy: int, sx: int, top: int, left: int) -> None:
         """Copy the part of a window that lies inside the image; ``out`` is zero before."""

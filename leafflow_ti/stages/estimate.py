@@ -25,6 +25,7 @@ from leafflow_ti.sampling import (
 )
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, OwnFlows, Problem
+from leafflow_ti.trace import span
 
 BATCH_BYTES = 8 << 20
 """Workspace of one batch of pixels: it should stay in the processor's cache."""
@@ -347,18 +348,21 @@ class EstimateStage:
 
             def flow_of(tables: _Tables, solution: int) -> None:
                 """Parameters of one data vector; covariance of its rows along t."""
-                ESTIMATORS[problem.estimator](self, tables)(partial(launch, tables=tables))
-                launch(covariance.row_covariance, tables, which=solution)
+                with span("solve"):
+                    ESTIMATORS[problem.estimator](self, tables)(partial(launch, tables=tables))
+                    launch(covariance.row_covariance, tables, which=solution)
 
             self._batch_groups = groups
             moving = "t" in problem.columns.solutions
             if moving:
                 flow_of(self.reference, problem.columns.n_time_like - 1)
             else:
-                ESTIMATORS[problem.estimator](self, self.reference)(launch)
+                with span("solve"):
+                    ESTIMATORS[problem.estimator](self, self.reference)(launch)
             for camera in range(len(problem.camera_axes)):
-                launch(covariance.row_covariance, which=camera)
-                launch(covariance.add_camera, which=camera)
+                with span("solve"):
+                    launch(covariance.row_covariance, which=camera)
+                    launch(covariance.add_camera, which=camera)
             if problem.camera_axes:
                 launch(covariance.geometry)
             if problem.range_scale is not None:
