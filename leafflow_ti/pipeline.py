@@ -69,7 +69,7 @@ class Pipeline:
     def __init__(self, plan: Plan, capture: Capture, device: Device, trace: Trace | None = None):
         self.plan, self.capture, self.device = plan, capture, device
         self.trace = trace or Trace()
-        self._reader = Reader(plan, capture, device.real("storage"), device.threads)
+        self._reader = Reader(plan, capture, device.real("storage"))
         self._engines: dict[int, _Engine] = {}
         # Output pixels of the plan and those around them; rows and columns below count along these.
         self._y, self._x = (_widened(r, n, plan.margin) for r, n in ((plan.y, capture.height), (plan.x, capture.width)))

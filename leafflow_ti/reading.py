@@ -19,6 +19,9 @@ from leafflow_ti.plan import Plan
 from leafflow_ti.trace import span
 
 Mask = NDArray[np.bool_]
+MAX_THREADS = 16
+"""One for each image of a frame, up to these: while a kernel runs none of them gets the interpreter, and between two
+kernels each gets it once, so that more threads than cores read faster."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +35,14 @@ class Box:
 
 
 class Reader:
-    """Reads the blocks of a plan; ``dtype``: type of their grey values; ``threads``: how many may decode at once.
+    """Reads the blocks of a plan; ``dtype``: type of their grey values.
 
     Raises ConfigError for a mask that does not fit the images.
     """
 
-    def __init__(self, plan: Plan, capture: Capture, dtype: type[np.floating[Any]], threads: int):
+    def __init__(self, plan: Plan, capture: Capture, dtype: type[np.floating[Any]]):
         self.plan, self.capture, self.dtype = plan, capture, dtype
-        # A thread that waits for the disk leaves its core to another.
-        self.threads = min(len(plan.cameras[0]) * len(plan.cameras[1]), max(2, threads))
+        self.threads = min(len(plan.cameras[0]) * len(plan.cameras[1]), MAX_THREADS)
         self.mask = _read_mask(plan.config.output.mask, capture)
 
     def blocks(self, frames: range, box: Box) -> Generator[tuple[NDArray[Any], Mask], None, None]:
@@ -54,8 +56,9 @@ class Reader:
         finite = np.ones(block.shape, bool)
         fills = self.capture.fills(block[None], [t], sy, sx, box.y, box.x, self.plan.preshift)
         images = (array.reshape(-1, box.rows, box.cols) for array in (block, finite))
+        whole = self.capture.dtype.kind in "bui"  # integers are finite
         pieces: list[Callable[[], None]] = [
-            partial(_fill, fill, *image) for fill, *image in zip(fills, *images, strict=True)
+            partial(_fill, whole, fill, *image) for fill, *image in zip(fills, *images, strict=True)
         ]
         return (block, finite), pieces
 
@@ -95,10 +98,12 @@ class Reader:
         )
 
 
-def _fill(fill: Callable[[], None], image: NDArray[Any], finite: Mask) -> None:
-    """Fill one image of a block, say where it is finite, and put 0 where it is not."""
+def _fill(whole: bool, fill: Callable[[], None], image: NDArray[Any], finite: Mask) -> None:
+    """Fill one image of a block; unless it is known to be ``whole``, say where it is finite, and put 0 elsewhere."""
     with span("decode"):
         fill()
+        if whole:
+            return
         np.isfinite(image, out=finite)
         if not finite.all():
             image[~finite] = 0

@@ -19,7 +19,9 @@ from typing import Any, Self
 
 import numpy as np
 import zarr
+from numcodecs import Zstd
 from numpy.typing import ArrayLike, NDArray
+from zarr.codecs import ZstdCodec
 from zarr.errors import NodeNotFoundError
 
 from leafflow_ti.errors import InputError, RunError, UsageError
@@ -29,6 +31,7 @@ from leafflow_ti.status import Status
 FORMAT = 1
 """Version of the layout, in the attribute ``leafflow_ti_format`` by which a store is recognised."""
 
+_COMPRESSOR = ZstdCodec(level=0, checksum=False)
 _METADATA = "zarr.json"
 """The group's metadata file, attributes included (Zarr v3)."""
 
@@ -103,6 +106,8 @@ class ResultStore:
                         fill_value=int(Status.NOT_COMPUTED) if name == "status" else float("nan"),
                         dimension_names=list(coordinates),
                         attributes=attributes,
+                        compressors=_COMPRESSOR,
+                        filters=None,
                     )
                 (scratch / "status" / ".done").mkdir()
                 if path.exists():
@@ -188,11 +193,32 @@ class ResultStore:
         if wrong:
             raise ValueError(f"unit {unit} needs the shape {shape}; {wrong[0]} has {arrays[wrong[0]].shape}")
         with _writing(self.path):
-            for name, values in arrays.items():
-                self._arrays[name][t_index, rows] = values
-                # A chunk that holds nothing but the fill value has no file.
-                _flush(self.path / name / "c" / str(t_index) / str(band) / "0", missing_ok=True)
+            # All files first: forcing the first of them to the disk then takes most of the others along.
+            files = [self._write_chunk(name, t_index, band, values) for name, values in arrays.items()]
+            for file in filter(None, files):
+                _flush(file)
             self._mark(unit)
+
+    def _write_chunk(self, name: str, t_index: int, band: int, values: NDArray[Any]) -> Path | None:
+        """Write one chunk file as the format prescribes, without the detour over the library's threads; its path.
+
+        The last band's chunk is filled up to the height of the others; one that holds nothing but the fill value has
+        no file.
+        """
+        array = self._arrays[name]
+        if array.compressors != (_COMPRESSOR,) or array.filters:
+            raise RunError(f"{self.path}: {name} is stored in a way that this program does not write: use --overwrite")
+        chunk = np.full(array.chunks[1:], array.fill_value, array.dtype)
+        chunk[: len(values)] = values
+        folder = self.path / name / "c" / str(t_index) / str(band)
+        if np.array_equal(chunk, np.broadcast_to(array.fill_value, chunk.shape), equal_nan=chunk.dtype.kind == "f"):
+            (folder / "0").unlink(missing_ok=True)
+            return None
+        folder.mkdir(parents=True, exist_ok=True)
+        scratch = folder / ".0"
+        little = chunk.astype(chunk.dtype.newbyteorder("<"), copy=False)
+        scratch.write_bytes(Zstd(level=_COMPRESSOR.level).encode(little))
+        return scratch.replace(folder / "0")
 
     def _mark(self, unit: int) -> None:
         folder = self.path / "status" / ".done"
@@ -258,16 +284,11 @@ def _writing(path: Path) -> Iterator[None]:
         raise RunError(f"{path}: cannot be written ({reason}): mend that, then run again with --resume") from error
 
 
-def _flush(path: Path, missing_ok: bool = False) -> None:
+def _flush(path: Path) -> None:
     """Force a file, or the entries of a folder, to the disk."""
     if path.is_dir() and os.name == "nt":  # Windows opens no folders and needs no such step
         return
-    try:
-        handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    except FileNotFoundError:
-        if missing_ok:
-            return
-        raise
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(handle)
     finally:

@@ -7,6 +7,7 @@ must stay exact.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -75,10 +76,17 @@ def read_window(path: Path, page: int, channel: Channel, y0: int, y1: int, x0: i
 
 def _format(path: Path) -> str:
     try:
-        with path.open("rb") as file:
-            head = file.read(8)
+        stat = path.stat()
+        return _format_of(path, stat.st_size, stat.st_mtime_ns)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}): check the path and its permissions") from error
+
+
+@lru_cache(maxsize=4096)
+def _format_of(path: Path, _size: int, _mtime_ns: int) -> str:
+    """Format by the first bytes, remembered until size or time of the file change."""
+    with path.open("rb") as file:
+        head = file.read(8)
     if head[:4] in _TIFF_MAGIC:
         return "tiff"
     if head == simple_formats.PNG_MAGIC:
