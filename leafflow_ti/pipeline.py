@@ -84,24 +84,40 @@ class Pipeline:
 
         # The work on the tiny band is no stage of its own: it all counts as compiling.
         with active(None), self.trace.span("compile"), quick_front_end():
-            plan = self.plan
-            band = Band.of(plan.problem.sampling, 1, 1, plan.config.window.stride)
-            engine = self._make_engine(band)
-            shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
-            if engine.ranges:
-                shape = (*shape[:2], engine.ranges.outer.in_rows, engine.ranges.outer.in_cols)
-                engine.ranges.move(engine.estimate.view, (0, 0))
-            grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
-            ok = np.ones(shape[2:], bool)
+            self._one_pixel(None)
+        return self.trace.seconds["compile"]
+
+    def least_seconds(self) -> dict[str, float]:
+        """Seconds per stage of one more frame of a band of one pixel, kernels compiled: launches and little else."""
+        trace = Trace(barrier=self.device.synchronize)
+        self._one_pixel(trace)
+        return trace.seconds
+
+    def _one_pixel(self, trace: Trace | None) -> None:
+        """Compute one pixel from random images until its windows are full, then one frame more for the trace."""
+        plan = self.plan
+        band = Band.of(plan.problem.sampling, 1, 1, plan.config.window.stride)
+        engine = self._make_engine(band)
+        shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
+        if engine.ranges:
+            shape = (*shape[:2], engine.ranges.outer.in_rows, engine.ranges.outer.in_cols)
+            engine.ranges.move(engine.estimate.view, (0, 0))
+        grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
+        ok = np.ones(shape[2:], bool)
+
+        def one_more() -> Any:
             sample = Sample(grey, ok, np.zeros(shape[2:], np.uint8))
             if engine.ranges:
                 sample = engine.ranges.sample(plan.frames[0], grey, ok, ok)
-            tensors = None
-            while tensors is None:
-                tensors = engine.push(sample)
-            engine.estimate(*tensors)
-            self.device.synchronize()
-        return self.trace.seconds["compile"]
+            return engine.push(sample)
+
+        while (tensors := one_more()) is None:
+            pass
+        engine.estimate(*tensors)
+        if trace is not None:
+            with active(trace):
+                engine.estimate(*one_more())
+        self.device.synchronize()
 
     def run(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
         """Compute every unit that is not ``done`` and hand over its maps [rows, columns] and status."""
@@ -168,10 +184,8 @@ class Pipeline:
         Only the rectangle of measurable pixels is computed; what lies around it is border.
         """
         plan = self.plan
-        whole = self._around(plan.band(index))
-        rows = slice(max(whole.start, self._rows.start), min(whole.stop, self._rows.stop))
-        cols = self._cols
-        if rows.start >= rows.stop or cols.start >= cols.stop:
+        whole, (rows, cols) = self._around(plan.band(index)), self.extent(index)
+        if rows.start == rows.stop or cols.start == cols.stop:
             for t_index in range(first, last + 1):
                 yield plan.unit(t_index, index), *self._frame_of(index, {}, None, None)
             return
@@ -207,6 +221,12 @@ class Pipeline:
                         maps, status = self._maps(engine.estimate(*tensors), waiting[0], centre)
                         result = self._frame_of(index, maps, status, place)
                 yield plan.unit(first + t - latency - plan.frames[first], index), *result
+
+    def extent(self, index: int) -> tuple[slice, slice]:
+        """Rows and columns of a band that are computed, those for the sake of others included; empty: all border."""
+        whole = self._around(self.plan.band(index))
+        first = max(whole.start, self._rows.start)
+        return slice(first, max(first, min(whole.stop, self._rows.stop))), self._cols
 
     def _around(self, rows: slice) -> slice:
         """Rows of the plan, and those that are computed around them."""
