@@ -54,7 +54,7 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
     from leafflow_ti.kernels.engine import quick_front_end
 
     began = time.perf_counter()
-    device = _start(config)
+    device = start_device(config)
     pipeline = Pipeline(plan, capture, device)
     shape = (len(plan.y), len(plan.x))
     maps: Maps = {name: np.full(shape, np.nan, np.float32) for name in plan.names}
@@ -93,7 +93,7 @@ def run(
         capture = open_capture(capture)
     config = config or RunConfig()
     plan = make_plan(capture, config)
-    device = _start(config)
+    device = start_device(config)
     provenance = _provenance(plan, capture, device)
     store = _open_store(Path(out), plan, capture, provenance, resume, overwrite)
     before = Timings.of(store.attrs.get("timings"))
@@ -129,7 +129,8 @@ def run(
     return RunSummary(now.seconds, compile_seconds, str(device), counts, now.stages, str(out))
 
 
-def _start(config: RunConfig) -> Device:
+def start_device(config: RunConfig) -> Device:
+    """The device that a configuration asks for; raises DeviceError."""
     threads = config.plan.threads
     return start(config.arch, config.precision, None if threads == "auto" else int(threads))
 
@@ -145,10 +146,16 @@ def _open_store(
                     f"{out} cannot be resumed: its {key} differs from this run's; use --overwrite, or another output"
                 )
         return store
+    return create_store(out, plan, provenance, capture.frame_interval_s, overwrite)
+
+
+def create_store(
+    out: Path, plan: Plan, attrs: dict[str, Any], interval_s: float | None = None, overwrite: bool = False
+) -> ResultStore:
+    """An empty results store for a plan; errors as of ``ResultStore.create``."""
     return ResultStore.create(
         out, frames=plan.frames, y=np.array(plan.y), x=np.array(plan.x), names=plan.names,
-        chunk=(1, plan.band_rows, len(plan.x)), attrs=provenance, interval_s=capture.frame_interval_s,
-        overwrite=overwrite,
+        chunk=(1, plan.band_rows, len(plan.x)), attrs=attrs, interval_s=interval_s, overwrite=overwrite,
     )  # fmt: skip
 
 

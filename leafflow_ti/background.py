@@ -24,7 +24,7 @@ Prepared = tuple[Value, list[Callable[[], None]]]
 """A value, and the independent pieces of work that fill it."""
 
 
-def ahead(
+def prepared(
     prepare: Callable[[Item], Prepared[Value]], items: Iterable[Item], depth: int, threads: int
 ) -> Generator[Value, None, None]:
     """The values of ``items`` in their order, filled by ``threads`` up to ``depth`` items before they are asked for.

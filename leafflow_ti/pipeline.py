@@ -60,6 +60,19 @@ class _Engine:
         return None if tensor is None else (tensor, own)
 
 
+@dataclass(frozen=True)
+class _Stay:
+    """An engine over one band. ``box``: block of images that it needs, with the prefilter's margin; ``allowed``
+    [rows, cols] of the block without it: pixels that may count; ``place``: of the computed rectangle among the rows
+    around the band; ``centre``: the block's pixels at the output positions."""
+
+    engine: _Engine
+    box: Box
+    allowed: NDArray[np.bool_]
+    place: tuple[slice, slice]
+    centre: tuple[slice, slice]
+
+
 class Pipeline:
     """Computes the units of a plan on a device.
 
@@ -184,11 +197,34 @@ class Pipeline:
         Only the rectangle of measurable pixels is computed; what lies around it is border.
         """
         plan = self.plan
-        whole, (rows, cols) = self._around(plan.band(index)), self.extent(index)
+        rows, cols = self.extent(index)
         if rows.start == rows.stop or cols.start == cols.stop:
             for t_index in range(first, last + 1):
                 yield plan.unit(t_index, index), *self._frame_of(index, {}, None, None)
             return
+        stay = self._move(index)
+        engine, latency = stay.engine, stay.engine.tensor.latency
+        frames = range(plan.frames[first] - latency, plan.frames[last] + latency + 1)
+        waiting: deque[Sample] = deque(maxlen=latency + 1)
+        with contextlib.closing(self._reader.blocks(frames, stay.box)) as blocks:
+            for t in frames:
+                with span("host", f"frame {t}"):
+                    sample = self._sample(stay, t, *next(blocks))
+                    tensors = engine.push(sample)
+                    waiting.append(replace(sample, block=_NO_IMAGES))  # its images may go
+                    del sample
+                    if tensors is None:
+                        continue
+                    self.device.synchronize()
+                    with span("fit"):
+                        maps, status = self._maps(engine.estimate(*tensors), waiting[0], stay.centre)
+                        result = self._frame_of(index, maps, status, stay.place)
+                yield plan.unit(first + t - latency - plan.frames[first], index), *result
+
+    def _move(self, index: int) -> _Stay:
+        """Bring an engine, all frames forgotten, to the measurable rectangle of a band."""
+        plan = self.plan
+        whole, (rows, cols) = self._around(plan.band(index)), self.extent(index)
         band = Band.of(plan.problem.sampling, rows.stop - rows.start, cols.stop - cols.start, plan.x.step)
         if band.rows not in self._engines:
             self._engines.clear()  # bands come in order: one engine's memory at a time
@@ -200,27 +236,18 @@ class Pipeline:
         centre = _centres(band)
         if engine.ranges:
             band, corner = engine.ranges.outer, engine.ranges.move(engine.estimate.view, corner)
-        allowed = self._reader.inside(Box(*corner, band.in_rows, band.in_cols))
+        inner = Box(*corner, band.in_rows, band.in_cols)
         margin = engine.prefilter.radius if engine.prefilter else 0
-        box = Box(corner[0] - margin, corner[1] - margin, band.in_rows + 2 * margin, band.in_cols + 2 * margin)
         place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
-        latency = engine.tensor.latency
-        frames = range(plan.frames[first] - latency, plan.frames[last] + latency + 1)
-        waiting: deque[Sample] = deque(maxlen=latency + 1)
-        with contextlib.closing(self._reader.blocks(frames, box)) as blocks:
-            for t in frames:
-                with span("host", f"frame {t}"):
-                    sample = self._sample(engine, t, *next(blocks), box, allowed)
-                    tensors = engine.push(sample)
-                    waiting.append(replace(sample, block=_NO_IMAGES))  # its images may go
-                    del sample
-                    if tensors is None:
-                        continue
-                    self.device.synchronize()
-                    with span("fit"):
-                        maps, status = self._maps(engine.estimate(*tensors), waiting[0], centre)
-                        result = self._frame_of(index, maps, status, place)
-                yield plan.unit(first + t - latency - plan.frames[first], index), *result
+        return _Stay(engine, inner.widened(margin), self._reader.inside(inner), place, centre)
+
+    def read_alone(self, index: int, frames: range) -> dict[str, float]:
+        """Seconds of reading and of decoding a band's images of these frames while nothing else goes on."""
+        trace, box = Trace(), self._move(index).box
+        with active(trace), contextlib.closing(self._reader.blocks(frames, box, ahead=0)) as blocks:
+            for _ in blocks:
+                pass
+        return trace.seconds
 
     def extent(self, index: int) -> tuple[slice, slice]:
         """Rows and columns of a band that are computed, those for the sake of others included; empty: all border."""
@@ -261,18 +288,11 @@ class Pipeline:
         inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
         return {n: framed[n][inner].copy() for n in plan.names}, codes[inner].copy()
 
-    def _sample(
-        self,
-        engine: _Engine,
-        t: int,
-        block: NDArray[Any],
-        finite: NDArray[np.bool_],
-        box: Box,
-        allowed: NDArray[np.bool_],
-    ) -> Sample:
-        """What the tensor stages take: one frame's images [sy, sx, rows, cols] in ``box``, prefiltered."""
+    def _sample(self, stay: _Stay, t: int, block: NDArray[Any], finite: NDArray[np.bool_]) -> Sample:
+        """What the tensor stages take: one frame's images [sy, sx, rows, cols] of a stay, prefiltered."""
+        engine, allowed = stay.engine, stay.allowed
         if engine.prefilter:
-            block, finite = self._prefiltered(engine.prefilter, t, block, finite, box)
+            block, finite = self._prefiltered(engine.prefilter, t, block, finite, stay.box)
         everywhere = np.asarray(finite.all(axis=(0, 1)))
         if engine.ranges:
             return engine.ranges.sample(t, block, allowed & everywhere, everywhere)

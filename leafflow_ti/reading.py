@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.background import ahead
+from leafflow_ti.background import prepared
 from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import read_gray
 from leafflow_ti.errors import ConfigError, InputError
@@ -33,6 +33,10 @@ class Box:
     rows: int
     cols: int
 
+    def widened(self, margin: int) -> Box:
+        """The block with ``margin`` pixels more on every side."""
+        return Box(self.y - margin, self.x - margin, self.rows + 2 * margin, self.cols + 2 * margin)
+
 
 class Reader:
     """Reads the blocks of a plan; ``dtype``: type of their grey values.
@@ -45,9 +49,15 @@ class Reader:
         self.threads = min(len(plan.cameras[0]) * len(plan.cameras[1]), MAX_THREADS)
         self.mask = _read_mask(plan.config.output.mask, capture)
 
-    def blocks(self, frames: range, box: Box) -> Generator[tuple[NDArray[Any], Mask], None, None]:
-        """For each frame the block [sy, sx, rows, cols], 0 where not finite, and where it is finite."""
-        return ahead(partial(self._prepare, box), frames, self.plan.read_ahead, self.threads)
+    def blocks(
+        self, frames: range, box: Box, ahead: int | None = None
+    ) -> Generator[tuple[NDArray[Any], Mask], None, None]:
+        """For each frame the block [sy, sx, rows, cols], 0 where not finite, and where it is finite.
+
+        ``ahead``: how many frames are read before they are asked for; default: as planned.
+        """
+        depth = self.plan.read_ahead if ahead is None else ahead
+        return prepared(partial(self._prepare, box), frames, depth, self.threads)
 
     def _prepare(self, box: Box, t: int) -> tuple[tuple[NDArray[Any], Mask], list[Callable[[], None]]]:
         """An empty block of one frame, and the work that fills it."""

@@ -25,7 +25,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("growth",), 5),
     **dict.fromkeys(("bands", "plan", "reading", "pipeline", "results", "work"), 6),
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
-    **dict.fromkeys(("quicklook", "api"), 7),
+    **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases"), 7),
     **dict.fromkeys(("cli",), 8),
 }
 """Part of the package -> layer. A part imports from lower layers and, without cycles, from its own."""
