@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -28,6 +29,9 @@ from leafflow_ti.errors import InputError, RunError, UsageError
 from leafflow_ti.field import QUANTITIES, Field, map_attributes
 from leafflow_ti.status import Status
 
+WRITERS = 16
+"""Chunks of a unit that are written together: the disk forces them out at once, and while kernels run, which hold the
+interpreter, each of the threads gets on a step between two of them."""
 FORMAT = 1
 """Version of the layout, in the attribute ``leafflow_ti_format`` by which a store is recognised."""
 
@@ -193,14 +197,13 @@ class ResultStore:
         if wrong:
             raise ValueError(f"unit {unit} needs the shape {shape}; {wrong[0]} has {arrays[wrong[0]].shape}")
         with _writing(self.path):
-            # All files first: forcing the first of them to the disk then takes most of the others along.
-            files = [self._write_chunk(name, t_index, band, values) for name, values in arrays.items()]
-            for file in filter(None, files):
-                _flush(file)
+            with ThreadPoolExecutor(WRITERS) as pool:
+                for _ in pool.map(lambda item: self._write_chunk(t_index, band, *item), arrays.items()):
+                    pass
             self._mark(unit)
 
-    def _write_chunk(self, name: str, t_index: int, band: int, values: NDArray[Any]) -> Path | None:
-        """Write one chunk file as the format prescribes, without the detour over the library's threads; its path.
+    def _write_chunk(self, t_index: int, band: int, name: str, values: NDArray[Any]) -> None:
+        """Write one chunk file as the format prescribes, forced to the disk, without the library's own threads.
 
         The last band's chunk is filled up to the height of the others; one that holds nothing but the fill value has
         no file.
@@ -213,12 +216,14 @@ class ResultStore:
         folder = self.path / name / "c" / str(t_index) / str(band)
         if np.array_equal(chunk, np.broadcast_to(array.fill_value, chunk.shape), equal_nan=chunk.dtype.kind == "f"):
             (folder / "0").unlink(missing_ok=True)
-            return None
+            return
         folder.mkdir(parents=True, exist_ok=True)
         scratch = folder / ".0"
-        little = chunk.astype(chunk.dtype.newbyteorder("<"), copy=False)
-        scratch.write_bytes(Zstd(level=_COMPRESSOR.level).encode(little))
-        return scratch.replace(folder / "0")
+        with scratch.open("wb") as file:
+            file.write(Zstd(level=_COMPRESSOR.level).encode(chunk.astype(chunk.dtype.newbyteorder("<"), copy=False)))
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(folder / "0")
 
     def _mark(self, unit: int) -> None:
         folder = self.path / "status" / ".done"
