@@ -98,6 +98,7 @@ def run(
     store = _open_store(Path(out), plan, capture, provenance, resume, overwrite)
     before = Timings.of(store.attrs.get("timings"))
     done = store.done()
+    capture.keep_decoded(plan.cache_bytes)
     pipeline = Pipeline(plan, capture, device)
     compile_seconds = pipeline.warm_up() if len(done) < plan.n_units else 0.0
     todo = {u.index: (u.rows.stop - u.rows.start) * len(plan.x) for u in plan.units() if u.index not in done}

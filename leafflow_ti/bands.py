@@ -63,13 +63,17 @@ class Demand:
         return total + (1 + ahead) * block + (2 + WRITE_BEHIND) * unit
 
 
+def usable_memory(config: RunConfig) -> int:
+    """Bytes of the limit that arrays may take; the rest is the interpreter's, the engine's and the results'."""
+    return int(0.8 * config.plan.max_memory)
+
+
 def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int, int, int]:
     """Rows of a unit of ``rows`` output rows, its memory, and the first of ``depths`` to read ahead that fits.
 
     Raises ConfigError when nothing fits.
     """
-    plan = demand.config.plan
-    limit = int(0.8 * plan.max_memory)
+    plan, limit = demand.config.plan, usable_memory(demand.config)
     for ahead in depths:
         if plan.tile != "auto":
             chosen = min(int(plan.tile), rows)

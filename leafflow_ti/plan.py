@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
-from leafflow_ti.bands import READ_AHEAD, Demand, choose_bands
-from leafflow_ti.capture import ArrayCapture, Capture, Geometry, find_preshift
+from leafflow_ti.bands import READ_AHEAD, Demand, choose_bands, usable_memory
+from leafflow_ti.capture import DEFAULT_CACHE_BYTES, ArrayCapture, Capture, Geometry, find_preshift
 from leafflow_ti.config import RunConfig, resolve_model
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import choose_filter_set, filter_set
@@ -52,6 +52,8 @@ class Plan:
     """Memory of the largest unit's arrays, of the frames read ahead, and of the units that wait to be written."""
     read_ahead: int
     """Frames that are read before they are needed, while the device computes."""
+    cache_bytes: int
+    """Of these bytes, those of decoded images: kept where several bands need them and all of them fit, else 0."""
     ranges: RangePlan | None = None
 
     def reach(self, axis: str) -> int:
@@ -212,12 +214,16 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     cameras = _cameras(grid, problem.own_flows, *capture.reference)
     plan = Plan(
         config, name, problem, layout, _geometry(capture),
-        cameras, preshift, frames, y, x, len(y), 0, 0, ranges,
+        cameras, preshift, frames, y, x, len(y), 0, 0, 0, ranges,
     )  # fmt: skip
     depths = (0,) if isinstance(capture, ArrayCapture) else range(READ_AHEAD, -1, -1)
     demand = Demand(config, problem, layout, ranges, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))
     band_rows, memory, ahead = choose_bands(demand, len(y), depths)
-    return replace(plan, band_rows=band_rows, bytes=memory, read_ahead=ahead)
+    plan = replace(plan, band_rows=band_rows, bytes=memory, read_ahead=ahead)
+    cache = capture.cacheable_bytes if plan.bands > 1 else 0
+    if cache > min(DEFAULT_CACHE_BYTES, usable_memory(config) - memory):
+        cache = 0
+    return replace(plan, bytes=memory + cache, cache_bytes=cache)
 
 
 def _sampling(capture: Capture, config: RunConfig, cameras: str, time: bool) -> Sampling:

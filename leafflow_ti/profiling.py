@@ -145,6 +145,7 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
     trace = Trace(keep=True, barrier=device.synchronize)
     if trace_file is not None:
         trace.write(trace_file)  # better refused now than after the work
+    capture.keep_decoded(plan.cache_bytes)
     pipeline = Pipeline(plan, capture, device, trace)
     band = max(range(plan.bands), key=lambda b: _height(pipeline.extent(b)))
     rows, cols = pipeline.extent(band)

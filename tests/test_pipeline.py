@@ -217,6 +217,23 @@ def test_little_memory_means_less_reading_ahead(on_disk: tuple[Path, np.ndarray]
     assert plenty.bytes - scarce.bytes == 5 * 5 * (61 + reach) * (43 + reach)
 
 
+def test_decoded_images_are_kept_where_bands_share_them(tmp_path: Path) -> None:
+    """One strip an image: whole images are decoded."""
+    write_scene(replace(SCENE, bits=8), tmp_path / "capture")
+    for path in (tmp_path / "capture").rglob("*.tif"):
+        tifffile.imwrite(path, tifffile.imread(path), compression="zlib")
+    files = lf.open_capture(tmp_path / "capture")
+    every = 13 * 5 * 43 * 61
+    several, one = (lf.plan_run(files, config(tile=tile)) for tile in (16, 43))
+    assert (several.bands, several.cache_bytes) == (3, every)
+    assert (one.bands, one.cache_bytes) == (1, 0)
+    assert several.bytes > every
+    lf.run(files, tmp_path / "one.zarr", config(tile=43, frames="4:5"))
+    assert files._cache.used == 0
+    lf.run(files, tmp_path / "several.zarr", config(tile=16, frames="4:5"))
+    assert files._cache.used == 9 * 5 * 43 * 61  # the frames that this run needs
+
+
 RUN_WITH_THREADS = """
 import sys
 import leafflow_ti as lf

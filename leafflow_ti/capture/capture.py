@@ -9,6 +9,7 @@ the files.
 from __future__ import annotations
 
 import hashlib
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -83,6 +84,14 @@ class Capture(ABC):
     def image_name(self, t: int, sy: int, sx: int) -> str:
         """What to call one image in a message."""
         return f"frame {t}, camera row {sy}, column {sx}"
+
+    @property
+    def cacheable_bytes(self) -> int:
+        """Memory that spares decoding an image for each of its windows, if all images are kept; 0: none does."""
+        return 0
+
+    def keep_decoded(self, n_bytes: int) -> None:  # noqa: B027 - most captures keep nothing
+        """Keep decoded images of at most so many bytes from now on."""
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any]:
@@ -166,6 +175,18 @@ class FileCapture(Capture):
         if self.layout.info.windowed:
             return self._checked(path, read_window(path, page, self.channel, y0, y1, x0, x1))
         return self._cache.get((path, page), lambda: self._decode(path, page))[y0:y1, x0:x1]
+
+    @property
+    def cacheable_bytes(self) -> int:
+        """See ``Capture``; a mixture of colours is kept as float."""
+        if self.layout.info.windowed:
+            return 0
+        itemsize = self.dtype.itemsize if self.layout.info.colour == "gray" else max(4, self.dtype.itemsize)
+        return math.prod(self.shape) * itemsize
+
+    def keep_decoded(self, n_bytes: int) -> None:
+        """See ``Capture``."""
+        self._cache.set_limit(n_bytes)
 
     def image_name(self, t: int, sy: int, sx: int) -> str:
         """The file, and the page where it holds several."""

@@ -57,7 +57,7 @@ def page_info(path: Path, page: int) -> ImageInfo:
 def read_window(path: Path, page: int, channel: Channel, y0: int, y1: int, x0: int, x1: int) -> Array:
     """Grey window ``[y1-y0, x1-x0]`` inside the page, as stored (a mixture of colours as float).
 
-    Only the needed bytes or tiles are read where ``ImageInfo.windowed`` says so. Raises like ``read_gray``.
+    Only the needed bytes, strips or tiles are read where ``ImageInfo.windowed`` says so. Raises like ``read_gray``.
     """
     info = page_info(path, page)
     if not (0 <= y0 < y1 <= info.height and 0 <= x0 < x1 <= info.width):
