@@ -166,7 +166,8 @@ class Plan:
             f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.config.window.stride}: "
             f"{', '.join(self.names)}",
             f"units       {self.n_units}: {self.bands} bands of up to {self.band_rows} rows per frame",
-            f"memory      {self.bytes / 2**20:.0f} MiB for one unit, limit {limit / 2**20:.0f} MiB",
+            f"memory      {self.bytes / 2**20:.0f} MiB for one unit, {self.read_ahead} frames read ahead, "
+            f"{self.cache_bytes / 2**20:.0f} MiB of them decoded images; limit {limit / 2**20:.0f} MiB",
             f"disk        at most {pixels * (4 * len(self.names) + 1) / 2**20:.0f} MiB",
         ]
         return "\n".join(lines)

@@ -35,9 +35,10 @@ class Progress:
 class Timings:
     """What units have cost: ``seconds`` on the clock and per stage, all runs that worked on a results store together.
 
-    ``stages``: those of ``trace.STAGES``; what happens beside the computing (reading, decoding, writing) overlaps it,
-    so that the stages' sum may exceed ``seconds``. ``units`` and ``pixels`` are those that the seconds belong to; a run
-    that was killed loses neither. ``frames``: ``units`` in whole frames. ``device``: of the latest run.
+    ``stages``: those of ``trace.STAGES``; what happens beside the computing (reading, decoding, writing) overlaps it and
+    waits between two steps while kernels run, so that the stages' sum may exceed ``seconds``. ``units`` and ``pixels``
+    are those that the seconds belong to, so that a run that was killed does not spoil the speed. ``frames``: ``units``
+    in whole frames. ``device``: of the latest run.
     """
 
     seconds: float = 0.0
