@@ -25,6 +25,7 @@ from leafflow_ti.sampling import (
 )
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, OwnFlows, Problem
+from leafflow_ti.trace import span
 
 BATCH_BYTES = 16 << 20
 """Workspace of one batch of pixels on the CPU where the steps are launched apart."""
@@ -425,11 +426,12 @@ class EstimateStage:
         n_groups = view.rows * self._row_groups
         for first in range(0, n_groups, self._groups):
             groups = min(self._groups, n_groups - first)
-            for kernel, begin, end, _ in self._launches():
-                kernel(
-                    first, groups, task_step, group_step, self._row_groups, view.pitch, n_pixels, begin, end,
-                    min(groups, self._tasks), *self._on_device, tensors, workspace, self._maps,
-                )  # fmt: skip
+            for kernel, begin, end, part in self._launches():
+                with span(part):
+                    kernel(
+                        first, groups, task_step, group_step, self._row_groups, view.pitch, n_pixels, begin, end,
+                        min(groups, self._tasks), *self._on_device, tensors, workspace, self._maps,
+                    )  # fmt: skip
         planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)
         result: NDArray[Any] = planes[:, :, : view.cols]
         return result
