@@ -37,6 +37,7 @@ class Step(IntEnum):
     TARGET_PLANE = auto()  # distance of the outputs
     TARGET_SLOTS = auto()
     TARGET_HOP = auto()
+    BLOCKS = auto()  # times BLOCK columns: of the widest output
     N = auto()
 
 
@@ -175,18 +176,19 @@ def _funcs(spec: KernelSpec):
 
 @functools.cache
 def arrange_kernel(spec: KernelSpec):
-    """Images [n, rows, cols] into vectors: ``dst[plane of image n][j][x]``, lane l being row ``l * segment + j``.
+    """Images [n, rows, cols] into vectors [tile, j, image, x], lane l being row ``l * segment + j``.
 
-    Rows beyond the last one repeat it.
+    A tile's columns x begin at ``tile * step``: neighbouring tiles overlap. So a tile reads one stretch of memory per
+    frame. Rows beyond the last one repeat it; columns beyond the last one are left as they are.
     """
     lanes = spec.lanes
 
     @ti.func
     def one_row(
-        n: ti.i32,
+        begin: ti.i32,  # of the image in src
         j: ti.i32,
-        x0: ti.i32,
-        x1: ti.i32,
+        first: ti.i32,
+        last: ti.i32,
         rows: ti.i32,
         cols: ti.i32,
         segment: ti.i32,
@@ -195,9 +197,10 @@ def arrange_kernel(spec: KernelSpec):
         dst: ti.template(),
     ):
         for lane in range(lanes):
-            begin = (n * rows + ti.min(lane * segment + j, rows - 1)) * cols
-            for x in range(x0, x1):
-                dst[(to + x) * lanes + lane] = src[begin + x]
+            at = begin + ti.min(lane * segment + j, rows - 1) * cols + first
+            place = to * lanes + lane
+            for x in range(last - first):
+                dst[place + x * lanes] = src[at + x]
 
     @ti.kernel
     def arrange(
@@ -206,31 +209,35 @@ def arrange_kernel(spec: KernelSpec):
         cols: ti.i32,
         segment: ti.i32,
         tall: ti.i32,
-        pitch: ti.i32,
+        n_tiles: ti.i32,
+        step: ti.i32,
+        width: ti.i32,
+        images: ti.i32,  # of a row of a tile
         to: ti.i32,
         n_tasks: ti.i32,
         src_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_images * rows * cols]
-        dst_out: ti.types.ndarray(dtype=spec.real, ndim=1),  # vectors [to + n_images * tall * pitch]
+        dst_out: ti.types.ndarray(dtype=spec.real, ndim=1),  # vectors [to + n_tiles * tall * images * width]
     ):
         if ti.static(spec.gpu):
             for g in range(n_images * tall * cols):
                 line = g // cols
                 x = g - line * cols
-                n = line // tall
+                j = line // n_images
+                n = line - j * n_images
                 one_row(
-                    n, line - n * tall, x, x + 1, rows, cols, segment, to + line * pitch, src_in, dst_out
-                )  # fmt: skip
+                    n * rows * cols, j, x, x + 1, rows, cols, segment, to + (j * images + n) * width + x, src_in, dst_out
+                )
         else:
             for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
                 if part == 0:
                     n_lines = n_images * tall
                     for line in range(task * n_lines // n_tasks, (task + 1) * n_lines // n_tasks):
                         n = line // tall
-                        # Few columns at a time: the lanes of a vector are written while it is in the cache.
-                        for strip in range((cols + 63) // 64):
+                        j = line - n * tall
+                        for tile in range(n_tiles):
                             one_row(
-                                n, line - n * tall, strip * 64, ti.min(strip * 64 + 64, cols), rows, cols, segment,
-                                to + line * pitch, src_in, dst_out,
+                                n * rows * cols, j, tile * step, ti.min(tile * step + width, cols), rows, cols, segment,
+                                to + ((tile * tall + j) * images + n) * width, src_in, dst_out,
                             )  # fmt: skip
 
     return arrange
@@ -240,7 +247,7 @@ def arrange_kernel(spec: KernelSpec):
 def tile_kernel(spec: KernelSpec):
     """All steps from raw frames to the maps of one frame, tile by tile of columns; for CPUs.
 
-    ``steps`` [n_steps, Step.N]: the first reads raw frames, the last one writes maps. Steps before ``n_early`` run
+    ``steps`` [n_steps, Step.N]: the first ``n_raw`` read raw frames, the last one writes maps. Those before ``n_early`` run
     ``2 halo`` rows ahead of those behind it; the last one runs when the ``length`` rows of a block of maps are there.
     """
     linear, products, _ = _funcs(spec)
@@ -249,11 +256,11 @@ def tile_kernel(spec: KernelSpec):
     @lane_kernel(spec.lanes)
     def filter_tiles(
         n_steps: ti.i32,
+        n_raw: ti.i32,
         n_early: ti.i32,
         n_tiles: ti.i32,
         n_tasks: ti.i32,
-        tile: ti.i32,  # raw columns from one tile to the next
-        raw_pitch: ti.i32,
+        raw_row: ti.i32,  # distance of the rows of raw frames
         n_rows: ti.i32,  # rows of maps before they are summed over blocks
         halo: ti.i32,
         oldest: ti.i32,  # slot of the oldest raw frame
@@ -288,22 +295,24 @@ def tile_kernel(spec: KernelSpec):
                 for t in range(task * n_tiles // n_tasks, (task + 1) * n_tiles // n_tasks):
                     for i in range(n_rows + 2 * halo):
                         last = n_steps - 1
-                        raw_at = t * tile + i * raw_pitch
-                        slot = i % steps[Step.TARGET_SLOTS]
-                        for o in range(steps[Step.FIRST], steps[Step.LAST]):
-                            if i >= trim[o] and i < n_rows + 2 * halo - trim[o]:
-                                place = home + steps[Step.TARGET] + o * steps[Step.TARGET_PLANE]
-                                place += slot * steps[Step.TARGET_HOP]
-                                for c in range(n_blocks[o]):
-                                    x = column[o] + BLOCK * c
-                                    linear(
-                                        o, raw_at + x, 1, oldest, steps[Step.SLOTS], steps[Step.HOP], place + x,
-                                        first, offset, ring, weight, raw, scratch,
-                                    )  # fmt: skip
+                        raw_at = (t * (n_rows + 2 * halo) + i) * raw_row
+                        for s in range(n_raw):
+                            at = s * Step.N
+                            place = home + steps[at + Step.TARGET]
+                            place += (i % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
+                            for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
+                                if i >= trim[o] and i < n_rows + 2 * halo - trim[o]:
+                                    to = place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE]
+                                    for c in range(n_blocks[o]):
+                                        x = column[o] + BLOCK * c
+                                        linear(
+                                            o, raw_at + x, 1, oldest, steps[at + Step.SLOTS], steps[at + Step.HOP],
+                                            to + x, first, offset, ring, weight, raw, scratch,
+                                        )  # fmt: skip
                         until = n_early
                         if i >= 2 * halo:
                             until = last
-                        for s in range(1, until):
+                        for s in range(n_raw, until):
                             at = s * Step.N
                             # Steps behind the early ones work on the row that all their rows are there for.
                             row = i
@@ -311,12 +320,12 @@ def tile_kernel(spec: KernelSpec):
                                 row = i - 2 * halo
                             if steps[at + Step.PRODUCTS] == 1:
                                 plane = steps[at + Step.TARGET_PLANE]
-                                for g in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
-                                    place = home + steps[at + Step.TARGET] + inner
-                                    place += (g - steps[at + Step.FIRST]) * POWERS * plane
-                                    for c in range(inner_blocks):
+                                place = home + steps[at + Step.TARGET] + inner
+                                for c in range(inner_blocks):
+                                    for g in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
                                         products(
-                                            g, home + inner + BLOCK * c, invalid, place + BLOCK * c, plane,
+                                            g, home + inner + BLOCK * c, invalid,
+                                            place + (g - steps[at + Step.FIRST]) * POWERS * plane + BLOCK * c, plane,
                                             group, one, two, factor, constant, scratch, scratch,
                                         )  # fmt: skip
                             else:
@@ -324,14 +333,16 @@ def tile_kernel(spec: KernelSpec):
                                 gap = steps[at + Step.COLUMN_STEP]
                                 place = home + steps[at + Step.TARGET]
                                 place += (row % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
-                                for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
-                                    if s >= n_early or (i >= trim[o] and i < n_rows + 2 * halo - trim[o]):
-                                        to = place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE]
-                                        for c in range(n_blocks[o]):
+                                # Few columns of all outputs at a time: their sources are then in the nearest cache.
+                                for c in range(steps[at + Step.BLOCKS]):
+                                    for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
+                                        seen = s >= n_early or (i >= trim[o] and i < n_rows + 2 * halo - trim[o])
+                                        if seen and c < n_blocks[o]:
                                             x = column[o] + BLOCK * c
                                             linear(
                                                 o, home + x * gap, gap, top, steps[at + Step.SLOTS],
-                                                steps[at + Step.HOP], to + x,
+                                                steps[at + Step.HOP],
+                                                place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE] + x,
                                                 first, offset, ring, weight, scratch, scratch,
                                             )  # fmt: skip
                         begin = i - 2 * halo - (length - 1)

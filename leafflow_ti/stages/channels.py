@@ -209,7 +209,8 @@ class Channels:
         need = dict.fromkeys(self.finals, (0, 0))
         found = []
         for axis in reversed(order):
-            found.append(Pass(axis, need))
+            # Planes of one image follow each other: their sources are then in the cache.
+            found.append(Pass(axis, dict(sorted(need.items()))))
             before: dict[Plane, tuple[int, int]] = {}
             for plane, (ry, rx) in need.items():
                 r = len(self.kernel(axis, getattr(plane, axis))) // 2

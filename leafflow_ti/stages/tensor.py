@@ -167,8 +167,9 @@ class TensorStage:
         host = np.ascontiguousarray(images, device.real("storage")).reshape(-1)
         n, rows, cols = images.shape
         arrange_kernel(device.moments)(
-            n, rows, cols, g.segment, g.tall, g.raw_pitch, slot * lowered.frame_size + number * lowered.image_size,
-            device.tasks(n * g.tall), device.array(host) if device.gpu else host, self._raw,
+            n, rows, cols, g.segment, g.tall, g.n_tiles, g.tile, g.width, lowered.channels.n_images,
+            slot * lowered.frame_size + number * g.width, device.tasks(n * g.tall),
+            device.array(host) if device.gpu else host, self._raw,
         )  # fmt: skip
 
     def _make_maps(self) -> None:
@@ -187,7 +188,7 @@ class TensorStage:
         g = lowered.geometry
         steps, first, column, blocks, trim, offset, ring, weight, *products = self._filter_tables
         tile_kernel(device.moments)(
-            len(lowered.steps), lowered.n_early, g.n_tiles, self._n_tiling, g.tile, g.raw_pitch, g.map_rows, g.halo[0],
+            len(lowered.steps), lowered.n_raw, lowered.n_early, g.n_tiles, self._n_tiling, lowered.raw_row, g.map_rows, g.halo[0],
             self._pushed % self.n_taps, g.y.step, g.y.length, g.map_tile, maps_at, lowered.scratch, lowered.invalid,
             steps, first, column, blocks, trim, offset, ring, weight, *products,
             g.halo[1], -(-g.inner // 4), *(device.vectors(a, g.lanes) for a in (self._raw, self._scratch, self._maps)),

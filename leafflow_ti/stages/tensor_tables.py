@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.sampling import Sampling
-from leafflow_ti.stages.channels import EXTRA_PLANES, POWERS, Channels, MapKey, Plane
+from leafflow_ti.stages.channels import POWERS, Channels, MapKey, Pass, Plane
 from leafflow_ti.stages.planes import Terms, round_up
 from leafflow_ti.stages.windows import BlockMap, Windows, block_weights, taps, x_powers
 
@@ -19,9 +18,9 @@ UNROLLED = 4
 """Outputs that a CPU kernel makes at a time; the same number as ``kernels.moments.BLOCK``."""
 ALL_ROWS = 1 << 30
 """Slots of what keeps every row."""
-SCRATCH_BYTES = 1 << 19
+SCRATCH_BYTES = 1 << 22
 """Of one task on the CPU, so that it stays in a core's cache."""
-TILE = 32
+TILE = 64
 """Columns of a tile where that fits into the scratch."""
 
 
@@ -70,6 +69,11 @@ class Region:
         """Where a plane begins."""
         return self.base + plane * self.plane
 
+    @property
+    def rows(self) -> Region:
+        """How rows are kept, wherever that is."""
+        return Region(0, 0, self.slots, self.hop)
+
 
 class Linear:
     """Linear outputs, in the order of the steps that make them."""
@@ -111,7 +115,6 @@ class Geometry:
         self.tile = self.map_tile * self.x.step
         self.inner = (self.map_tile - 1) * self.x.step + self.x.length
         self.width = round_up(self.inner + 2 * halo[1], UNROLLED) + UNROLLED
-        self.raw_pitch = (self.n_tiles - 1) * self.tile + self.width
         self.out_pitch = round_up(band.cols, 64)
 
 
@@ -149,9 +152,13 @@ class Lowered:
         else:
             self._n_linear += n
         slots, hop = (source.slots, source.hop) if source else (1, 0)
+        widest = 0 if products else max(self.linear.blocks[first : first + n])
         self.steps.append(
-            [products, first, first + n, slots, hop, column_step, target.base, target.plane, target.slots, target.hop]
-        )
+            [
+                products, first, first + n, slots, hop, column_step, target.base, target.plane, target.slots, target.hop,
+                widest,
+            ]
+        )  # fmt: skip
 
     def _lay_out(self) -> None:
         # Filters look a little to the left of what a tile needs: room for that before the first plane.
@@ -163,38 +170,63 @@ class Lowered:
         self.scratch += self.geometry.width
 
     def _lay_out_filters(self) -> dict[Plane, int]:
-        """Steps of the passes along t, y, x and the camera axes; the places of the channels."""
-        channels, g = self.channels, self.geometry
+        """Steps of the passes along t, y, x and the camera axes; the places of the channels.
+
+        What the pass along y reads is kept for the rows from the first that it looks at to the newest one, all else for the
+        row that is worked on.
+        """
+        channels = self.channels
         active = [p for p in channels.passes if p.axis in "ty" or any(getattr(o, p.axis) != "1" for o in p.outputs)]
-        self.n_early = y = [p.axis for p in active].index("y")
-        source = Region(0, 0, 2 * channels.sampling.t.filter_radius + 1, self.frame_size)
-        places: dict[Plane, int] = {}
+        y = [p.axis for p in active].index("y")
+        reaches = [ry for ry, _ in active[y - 1].outputs.values()]
+        rings = {ry: self._region(reaches.count(ry), True, self.geometry.halo[0] + ry + 1) for ry in sorted(set(reaches))}
+        base = end = self.scratch
+        raw = Region(0, 0, 2 * channels.sampling.t.filter_radius + 1, self.frame_size)
+        places: dict[Plane, tuple[int, Region]] = {}
         for one in channels.passes:
             k = active.index(one) if one in active else -1
-            # A plane that a pass leaves alone stays where it is; only rows in a ring must be copied out of it.
-            kept = {p for p in one.outputs if k < 0 or (k > y and getattr(p, one.axis) == "1")}
-            outputs = {p: reach for p, reach in one.outputs.items() if p not in kept}
+            if k == y:
+                # Rows on the way into the rings are not needed any more: later ones take their place.
+                self.n_early, end, self.scratch = len(self.steps), self.scratch, base
             before, places = places, {}
-            for p in kept:
-                places[p] = before[channels.terms(one.axis, p)[0][0]]
-            if not outputs:
-                continue
-            target = self._region(len(outputs), k < y, 2 * g.halo[0] + 1 if k == y - 1 else 1)
-            for n, (plane, (ry, rx)) in enumerate(outputs.items()):
-                terms = []
-                for origin, shift, w in channels.terms(one.axis, plane):
-                    if one.axis == "t":
-                        at = (channels.image(origin) * self.image_size, filter_radius(channels, "t") + shift)
-                    elif one.axis == "y":
-                        at = (before[origin], g.halo[0] + shift)
-                    else:
-                        at = (before[origin] + shift, 0)
-                    terms.append((at, w))
-                self.linear.add(terms, g.halo[1] - rx, g.inner + 2 * rx, g.halo[0] - ry if k < y else 0)
-                places[plane] = target.at(n)
-            self._step(len(outputs), source, target)
-            source = target
-        return places
+            todo: dict[tuple[Region, Region | None], list[Plane]] = {}
+            for plane, (ry, _) in one.outputs.items():
+                at, source = before.get(channels.terms(one.axis, plane)[0][0], (0, raw))
+                # A plane that a pass leaves alone stays where it is; only out of a ring it must be copied.
+                if k < 0 or (k > y and getattr(plane, one.axis) == "1"):
+                    places[plane] = at, source
+                else:
+                    todo.setdefault((source.rows, rings[ry] if k == y - 1 else None), []).append(plane)
+            if k == 1:
+                self.n_raw = len(self.steps)
+            rows = self._region(sum(len(p) for (_, ring), p in todo.items() if ring is None), k < y)
+            for (source, ring), planes in todo.items():
+                target = ring or rows
+                self._filter(one, planes, before, source, target, early=k < y)
+                places |= {plane: (target.at(n), target) for n, plane in enumerate(planes)}
+                rows = replace(rows, base=target.at(len(planes))) if ring is None else rows
+        self.scratch = max(self.scratch, end)
+        return {plane: at for plane, (at, _) in places.items()}
+
+    def _filter(
+        self, one: Pass, planes: list[Plane], before: dict[Plane, tuple[int, Region]], source: Region, target: Region,
+        early: bool,
+    ) -> None:  # fmt: skip
+        """One step: some planes of a pass, whose sources keep equally many rows."""
+        channels, g = self.channels, self.geometry
+        for plane in planes:
+            terms = []
+            for origin, shift, w in channels.terms(one.axis, plane):
+                if one.axis == "t":
+                    place = (channels.image(origin) * g.width, filter_radius(channels, "t") + shift)
+                else:
+                    across, down = (shift, 0) if one.axis == "x" else (0, shift)
+                    row = g.halo[0] + down if one.axis == "y" else 0
+                    place = (before[origin][0] + across, row % source.slots)
+                terms.append((place, w))
+            ry, rx = one.outputs[plane]
+            self.linear.add(terms, g.halo[1] - rx, g.inner + 2 * rx, g.halo[0] - ry if early else 0)
+        self._step(len(planes), source, target)
 
     def _lay_out_products(self, places: dict[Plane, int]) -> tuple[dict[MapKey, int], Region]:
         """Derived channels, then maps; the places of the maps."""
@@ -242,14 +274,14 @@ class Lowered:
         self._step(len(self.block_maps), source, Region(0, g.map_plane, ALL_ROWS, g.map_pitch))
 
     @property
-    def image_size(self) -> int:
-        """Vectors of one raw image."""
-        return self.geometry.tall * self.geometry.raw_pitch
+    def raw_row(self) -> int:
+        """Vectors of one row of all raw planes, in one tile."""
+        return self.channels.n_images * self.geometry.width
 
     @property
     def frame_size(self) -> int:
-        """Vectors of all raw planes of a frame."""
-        return self.channels.n_images * self.image_size
+        """Vectors of all raw planes of a frame, tile by tile, row by row."""
+        return self.geometry.n_tiles * self.geometry.tall * self.raw_row
 
     @property
     def slot_size(self) -> int:
