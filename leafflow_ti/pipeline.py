@@ -19,7 +19,6 @@ from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import read_gray
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
-from leafflow_ti.models import TensorLayout
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import RangeEngine, Sample
 from leafflow_ti.runtime import Device
@@ -49,31 +48,21 @@ class Timings:
 
 @dataclass
 class _Engine:
-    """The stages for bands of one height: prefilter, tensor of the reference model, tensors of the own flows, estimate.
-
-    ``inner``: the cameras of a block under the filters and window of the reference model; ``own_cameras``: place of
-    each own flow's camera in a block.
-    """
+    """The stages for bands of one height: prefilter, tensors of the reference model and of the own flows, estimate."""
 
     prefilter: Prefilter | None
     tensor: TensorStage
-    own: list[TensorStage]
     estimate: EstimateStage
-    inner: tuple[slice, slice]
-    own_cameras: list[tuple[slice, slice]]
     ranges: RangeEngine | None = None
 
     def reset(self) -> None:
         """Forget all frames."""
-        for stage in (self.tensor, *self.own):
-            stage.reset()
+        self.tensor.reset()
 
     def push(self, sample: Sample) -> tuple[Any, list[Any]] | None:
         """Add a frame of every camera; the tensors once the windows are full."""
-        block, valid = sample.block, sample.valid
-        tensor = self.tensor.push(block[self.inner], valid, sample.factors)
-        own = [stage.push(block[at], valid) for stage, at in zip(self.own, self.own_cameras, strict=True)]
-        return None if tensor is None else (tensor, own)
+        tensor = self.tensor.push(sample.block, sample.valid, sample.factors)
+        return None if tensor is None else (tensor, self.tensor.tensors[1:])
 
 
 class Pipeline:
@@ -129,7 +118,8 @@ class Pipeline:
 
     def _make_engine(self, band: Band) -> _Engine:
         plan, problem = self.plan, self.plan.problem
-        tensor = TensorStage(self.device, problem.columns, plan.layout, problem.sampling, band)
+        own = problem.own_flows.requests if problem.own_flows else ()
+        tensor = TensorStage(self.device, problem.columns, plan.layout, problem.sampling, band, own)
         view = self._view((0, 0), band, tensor.out_pitch)
         ranges = RangeEngine(self.device, plan.ranges, problem.sampling, view, band) if plan.ranges else None
         read = ranges.outer if ranges else band
@@ -137,21 +127,8 @@ class Pipeline:
         prefilter = None
         if filters.prefilter != "none":
             prefilter = Prefilter(self.device, filters.prefilter, filters.sigma_pre, read.in_rows, read.in_cols)
-        own = problem.own_flows
-        stages: list[TensorStage] = []
-        places: list[tuple[slice, slice]] = []
-        first = [cameras[0] - at for cameras, at in zip(plan.cameras, self.capture.reference, strict=True)]
-        if own:
-            layout = TensorLayout.of(own.columns)
-            stages = [TensorStage(self.device, own.columns, layout, own.sampling, band) for _ in own.steps]
-            for x, y in own.steps:
-                places.append((slice(y - first[0], y - first[0] + 1), slice(x - first[1], x - first[1] + 1)))
-        sy, sx = (slice(-f - axis.radius, -f + axis.radius + 1) for f, axis in zip(
-            first, (problem.sampling.sy, problem.sampling.sx), strict=True
-        ))  # fmt: skip
         estimate = EstimateStage(self.device, problem, plan.layout, view, bool(plan.margin))
-        inner = (slice(None), slice(None)) if ranges else (sy, sx)  # range flow's block is one stack of images
-        return _Engine(prefilter, tensor, stages, estimate, inner, places, ranges)
+        return _Engine(prefilter, tensor, estimate, ranges)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
         """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.

@@ -132,7 +132,8 @@ class Plan:
         def axis(name: str) -> str:
             plan = sampling.axis(name)
             taps = f"{len(plan.filters.smooth)} taps" if plan.filters else "no filter"
-            return f"{name}: {taps}, window of {plan.size}"
+            blocks = f" in {len(plan.blocks.weights)} blocks of {plan.blocks.step}" if plan.blocks else ""
+            return f"{name}: {taps}, window of {plan.size}{blocks}"
 
         lines = [
             f"model       {self.model}: {MODELS[self.model].summary}, {problem.columns.n} columns, "
@@ -229,7 +230,7 @@ def _sampling(capture: Capture, config: RunConfig, cameras: str, time: bool) -> 
     w = config.window
     camera = ("cameras", config.filters.taps_camera, w.size_camera, w.sigma_camera, config.filters.taps)
     frames = ("frames", config.filters.taps_time, w.size_time, w.sigma_time, config.filters.taps)
-    pixel = AxisSampling.gaussian(filter_set(config.filters.taps), w.size, w.sigma)
+    pixel = AxisSampling.gaussian(filter_set(config.filters.taps), w.size, w.sigma, w.stride)
     return Sampling(
         pixel,
         pixel,
@@ -240,8 +241,10 @@ def _sampling(capture: Capture, config: RunConfig, cameras: str, time: bool) -> 
 
 
 def _static(config: RunConfig) -> RunConfig:
-    """The configuration for the depth of single frames: the motion's own choices do not concern it."""
-    return config.model_copy(update={"model": config.model.model_copy(update={"brightness_terms": "none"})})
+    """The configuration for the depth of single frames, of every pixel: the motion's own choices do not concern it."""
+    model = config.model.model_copy(update={"brightness_terms": "none"})
+    window = config.window.model_copy(update={"stride": 1})
+    return config.model_copy(update={"model": model, "window": window})
 
 
 def _problem(capture: Capture, config: RunConfig, name: str, motion: str | None) -> Problem:
@@ -400,17 +403,13 @@ def _band_rows(
     def size(n: int) -> int:
         # Two more rows and columns for the growth at the edges.
         band = Band.of(problem.sampling, n + 2, cols + 2, config.window.stride)
-        total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
+        own = problem.own_flows.requests if problem.own_flows else ()
+        total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize, own)
         read = band
         if ranges and ranges.depth and ranges.layout:
             depth = ranges.depth
             read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
             total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize)
-        own = problem.own_flows
-        if own:
-            total += len(own.steps) * band_bytes(
-                own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize
-            )
         if config.filters.prefilter != "none":
             total += prefilter_bytes(config.filters.sigma_pre, n_cameras, read.in_rows, read.in_cols, itemsize)
         return total
