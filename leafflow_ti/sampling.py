@@ -51,7 +51,7 @@ class Blocks:
         """Blocks for outputs at distance ``stride`` in place of a window of ``size`` samples; None: no such blocks.
 
         ``step`` is the largest divisor of ``stride`` that leaves ``LEAST_BLOCKS`` across the window. Their number is
-        the one whose window is nearest to ``size`` in length (the shorter of two), hence within half a block of it.
+        the one whose window is nearest to ``size`` in length (the shorter of two): within ``(step + 1) / 2`` samples of it.
         Weights are those of a Gaussian at the middles of the blocks, its σ such that the second moment of the window
         is ``moment``, or else as near to it as its length allows.
         """

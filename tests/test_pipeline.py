@@ -16,6 +16,7 @@ import pytest
 import leafflow_ti as lf
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import RunConfig, load_config
+from leafflow_ti.plan import make_plan
 from leafflow_ti.progress import Progress
 from leafflow_ti.stages.tensor import OUTPUT_PLANES
 from leafflow_ti.status import Status
@@ -79,6 +80,14 @@ def assert_same(one: lf.Field, two: lf.Field, part: tuple[slice, slice] = (slice
 def test_tiled_equals_whole(capture: Capture, tile: int, precision: str) -> None:
     whole = lf.estimate(capture, 6, **OPTIONS, tile=43, precision=precision)
     assert_same(whole, lf.estimate(capture, 6, **OPTIONS, tile=tile, precision=precision))
+
+
+@pytest.mark.parametrize("stride", [2, 4])
+def test_tiled_equals_whole_with_windows_of_blocks(capture: Capture, stride: int) -> None:
+    options = {**OPTIONS, "window": 19, "sigma": 5.0, "stride": stride}
+    assert "in 9 blocks of 2" in make_plan(capture, config(**options)).describe()
+    whole, tiled = (lf.estimate(capture, 6, **options, tile=tile) for tile in (22, 3))
+    assert_same(whole, tiled)
 
 
 def test_tiled_equals_whole_with_stride_and_mask(capture: Capture, tmp_path: Path) -> None:

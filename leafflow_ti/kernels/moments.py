@@ -45,9 +45,16 @@ def _funcs(spec: KernelSpec):
     """The formulas, for vectors or for single numbers."""
     block = 1 if spec.gpu else BLOCK
 
-    @ti.func
-    def zero():
-        return ti.Vector.zero(spec.real, spec.lanes) if ti.static(spec.lanes > 1) else ti.cast(0, spec.real)
+    if spec.lanes > 1:
+
+        @ti.func
+        def zero():
+            return ti.Vector.zero(spec.real, spec.lanes)
+    else:
+
+        @ti.func
+        def zero():
+            return ti.cast(0, spec.real)
 
     @ti.func
     def linear(

@@ -10,7 +10,6 @@ tensors have in common is computed once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from leafflow_ti.stages.planes import Terms
 from leafflow_ti.stages.tensor_tables import Band, Lowered, padded_tables
 from leafflow_ti.stages.windows import Windows, taps
 
-__all__ = ["EXTRA_PLANES", "FACTOR_PLANES", "OUTPUT_PLANES", "Band", "Request", "TensorStage", "band_bytes", "eroded"]
+__all__ = ["EXTRA_PLANES", "FACTOR_PLANES", "OUTPUT_PLANES", "Band", "Request", "TensorStage", "band_bytes"]
 OUTPUT_PLANES = 61
 TASKS = 32
 """Tasks of a launch that the memory plan allows for."""
@@ -218,14 +217,51 @@ class TensorStage:
             n_planes, device.tasks(n_planes * lowered.strips), g.block_rows, self.band.rows, g.step_y, taps(g.y),
             lowered.strips, g.out_pitch // g.lanes, *down, wide, tensor,
         )  # fmt: skip
-def eroded(valid: NDArray[np.bool_], ry: int, rx: int) -> NDArray[np.bool_]:
-    """Where all pixels within (ry, rx) are valid; without the outermost ry rows and rx columns."""
-    rows, cols = valid.shape[0] - 2 * ry, valid.shape[1] - 2 * rx
-    inside = np.ones((rows, cols), bool)
-    for dy, dx in product(range(2 * ry + 1), range(2 * rx + 1)):
-        inside &= valid[dy : dy + rows, dx : dx + cols]
-    return inside
 
+    def _make_maps_by_planes(self, maps_at: int) -> None:
+        """On a GPU: every step over whole planes."""
+        from leafflow_ti.kernels.moments import Step, linear_kernel, products_kernel
+
+        device, lowered = self.device, self._lowered
+        g, spec = lowered.geometry, device.moments
+        _, first, _, _, _, offset, ring, weight, *products = self._filter_tables
+        for number, step in enumerate(lowered.steps):
+            begin, n = step[Step.FIRST], step[Step.LAST] - step[Step.FIRST]
+            to, plane, pitch = step[Step.TARGET], step[Step.TARGET_PLANE], step[Step.TARGET_HOP]
+            if step[Step.PRODUCTS]:
+                products_kernel(spec)(
+                    n, begin, g.map_rows, g.width, lowered.invalid, to, plane, *products, self._scratch
+                )
+                continue
+            raw, last = number < lowered.n_raw, number == len(lowered.steps) - 1
+            rows = g.tall if number < lowered.n_early else g.block_segment if last else g.map_rows
+            linear_kernel(spec)(
+                n, begin, rows, g.map_tile if last or step[Step.COLUMN_STEP] > 1 else g.width,
+                g.y.step if last else 1, step[Step.COLUMN_STEP], 0, lowered.raw_row if raw else 0, int(not raw),
+                self._pushed % self.n_taps if raw else 0, step[Step.SLOTS], step[Step.HOP],
+                maps_at if last else to, plane, pitch, first, offset, ring, weight,
+                self._raw if raw else self._scratch, self._maps if last else self._scratch,
+            )  # fmt: skip
+
+    def _make_tensor_by_planes(self, number: int) -> None:
+        """On a GPU: sums over frames, windows along x, windows along y, each over whole planes."""
+        from leafflow_ti.kernels.moments import linear_kernel, window_kernel
+
+        lowered, spec = self._lowered, self.device.moments
+        g, windows, n_t = lowered.geometry, lowered.windows[number], self.sampling.t.size
+        sums, across, down, _ = self._window_tables[number]
+        linear_kernel(spec)(
+            windows.n_sums, 0, g.block_rows, g.map_pitch, 1, 1, 0, g.map_pitch, 0, self._n_maps % n_t, n_t,
+            lowered.slot_size, 0, g.map_plane, g.map_pitch, *sums[2:], self._maps, self._sums,
+        )  # fmt: skip
+        window_kernel(spec)(
+            len(windows.wides), g.block_rows, self.band.cols, g.map_pitch, g.step_x, 1, taps(g.x), g.out_pitch, *across,
+            self._sums, self._wide,
+        )  # fmt: skip
+        window_kernel(spec)(
+            len(windows.entries), self.band.rows, self.band.cols, g.step_y * g.out_pitch, 1, g.out_pitch, taps(g.y),
+            g.out_pitch, *down, self._wide, self.tensors[number],
+        )  # fmt: skip
 
 
 def band_bytes(

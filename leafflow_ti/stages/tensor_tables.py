@@ -320,7 +320,7 @@ class Lowered:
         n_t = self.channels.sampling.t.size
         sums = tasks * self.sums_size
         if self.gpu:
-            sums = max(sum(len(w.sources(s)) for s in w.sets) for w in windows) * g.map_plane
+            sums = max(w.n_sums for w in windows) * g.map_plane
         # What windows look at beyond the last row.
         beyond = UNROLLED * max(g.step_x, g.step_y) + g.width
         return [

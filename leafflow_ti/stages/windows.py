@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -96,6 +95,11 @@ class Windows:
         return [(i, power_table(blocks, wide[1], i)) for i in range(wide[1] + 1 if blocks.length > 1 else 1)]
 
     @property
+    def n_sums(self) -> int:
+        """Sums over frames of all sets."""
+        return sum(len(self.sources(s)) for s in self.sets)
+
+    @property
     def block_maps(self) -> list[BlockMap]:
         """All block sums of one frame that are needed."""
         return list(dict.fromkeys(b for s in self.sets for b in self.sources(s)))
@@ -114,6 +118,3 @@ def x_powers(maps: list[BlockMap]) -> list[tuple[MapKey, int]]:
 def taps(blocks: Blocks) -> int:
     """Blocks of a window."""
     return len(blocks.weights)
-
-
-__all__ = ["BlockMap", "WideSet", "Windows", "block_weights", "product", "taps", "x_powers"]
