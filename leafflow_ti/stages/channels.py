@@ -69,6 +69,10 @@ class MapKey(NamedTuple):
     powers: tuple[int, int] = (0, 0)
 
 
+MASS = MapKey(0, (EXTRAS[0],))
+"""The window mass is that of the valid pixels, the same for all requests."""
+
+
 @dataclass
 class Group:
     """Up to ``POWERS`` maps of the same products: pairs of planes, and a weight for each map. ``constant`` is added."""
@@ -97,6 +101,7 @@ class Channels:
     requests: tuple[Request, ...]
     groups: list[Group] = field(default_factory=list)
     derived: dict[str, tuple[Plane, Plane | None]] = field(default_factory=dict)
+    _terms: dict[tuple[str, Plane], list[tuple[Plane, int, float]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.sampling = self.requests[0].sampling
@@ -179,7 +184,9 @@ class Channels:
             for plane in planes:
                 extra.pairs.append((plane, plane))
                 extra.weights.append(tuple(float(k == p) for p in range(POWERS)))
-        self.groups += [extra, Group([MapKey(r, (EXTRAS[0],))], [], [], 1.0)]
+        self.groups.append(extra)
+        if r == 0:
+            self.groups.append(Group([MASS], [], [], 1.0))
 
     def _operand(self, request: Request, channel: str, where: tuple[int, int]) -> Plane | str:
         """A factor of a product: a filtered plane, or the name of a derived channel."""
@@ -223,14 +230,21 @@ class Channels:
 
     def terms(self, axis: str, plane: Plane) -> list[tuple[Plane, int, float]]:
         """What a plane is made of along one axis: sources, their offsets along t, y or x, weights."""
+        known = self._terms.get((axis, plane))
+        if known is not None:
+            return known
         kernel = self.kernel(axis, getattr(plane, axis))
-        source = plane._replace(**{axis: ""})
+        source = Plane(*("" if name == axis else value for name, value in zip(Plane._fields, plane, strict=True)))
         found = []
         for i, w in enumerate(kernel.tolist()):
             shift = i - len(kernel) // 2
-            if w:
-                moved = {"sy": {"row": plane.row + shift}, "sx": {"col": plane.col + shift}}.get(axis, {})
-                found.append((source._replace(**moved), 0 if moved else shift, w))
+            if w and axis == "sy":
+                found.append((Plane(plane.row + shift, *source[1:]), 0, w))
+            elif w and axis == "sx":
+                found.append((Plane(plane.row, plane.col + shift, *source[2:]), 0, w))
+            elif w:
+                found.append((source, shift, w))
+        self._terms[axis, plane] = found
         return found
 
     @property

@@ -9,6 +9,7 @@ tensors have in common is computed once.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,8 +30,10 @@ TASKS = 32
 """Tasks of a launch that the memory plan allows for."""
 
 
-def _tables(requests: Sequence[Request]) -> tuple[Channels, list[Windows]]:
-    return Channels(tuple(requests)), [Windows(r, n) for n, r in enumerate(requests)]
+@functools.lru_cache(maxsize=4)
+def _tables(requests: tuple[Request, ...]) -> tuple[Channels, list[Windows]]:
+    """What does not depend on the band."""
+    return Channels(requests), [Windows(r, n) for n, r in enumerate(requests)]
 
 
 class TensorStage:
@@ -52,7 +55,7 @@ class TensorStage:
         own: Sequence[Request] = (),
     ):
         self.device, self.band, self.sampling = device, band, sampling
-        lowered = Lowered(*_tables([Request(columns, layout, sampling), *own]), band, device.moments.lanes)
+        lowered = Lowered(*_tables((Request(columns, layout, sampling), *own)), band, device.moments.lanes)
         self._lowered = lowered
         self.n_taps = 2 * sampling.t.filter_radius + 1
         geometry = lowered.geometry
@@ -181,7 +184,7 @@ class TensorStage:
         self._n_maps += 1
 
     def _make_maps_by_tiles(self, maps_at: int) -> None:
-        from leafflow_ti.kernels.moments import tile_kernel
+        from leafflow_ti.kernels.moments_by_tiles import tile_kernel
 
         device, lowered = self.device, self._lowered
         g = lowered.geometry
@@ -198,7 +201,7 @@ class TensorStage:
         if self.device.gpu:
             self._make_tensor_by_planes(number)
             return
-        from leafflow_ti.kernels.moments import across_kernel, down_kernel
+        from leafflow_ti.kernels.moments_by_tiles import across_kernel, down_kernel
 
         device, lowered = self.device, self._lowered
         g, spec = lowered.geometry, self.device.moments
@@ -220,7 +223,8 @@ class TensorStage:
 
     def _make_maps_by_planes(self, maps_at: int) -> None:
         """On a GPU: every step over whole planes."""
-        from leafflow_ti.kernels.moments import Step, linear_kernel, products_kernel
+        from leafflow_ti.kernels.moments import Step
+        from leafflow_ti.kernels.moments_by_planes import linear_kernel, products_kernel
 
         device, lowered = self.device, self._lowered
         g, spec = lowered.geometry, device.moments
@@ -245,7 +249,7 @@ class TensorStage:
 
     def _make_tensor_by_planes(self, number: int) -> None:
         """On a GPU: sums over frames, windows along x, windows along y, each over whole planes."""
-        from leafflow_ti.kernels.moments import linear_kernel, window_kernel
+        from leafflow_ti.kernels.moments_by_planes import linear_kernel, window_kernel
 
         lowered, spec = self._lowered, self.device.moments
         g, windows, n_t = lowered.geometry, lowered.windows[number], self.sampling.t.size

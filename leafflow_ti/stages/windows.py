@@ -6,6 +6,7 @@ A moment ``Σ w(Δ) Δ^m p`` is summed block by block: with Δ = B + δ, the mid
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.models import AXES
 from leafflow_ti.sampling import Blocks
-from leafflow_ti.stages.channels import EXTRAS, MapKey, Request
+from leafflow_ti.stages.channels import EXTRAS, MASS, MapKey, Request
 
 Array = NDArray[np.float64]
 
@@ -68,7 +69,8 @@ class Windows:
             self.entries.append(list(windows.items()))
         for name in EXTRAS:
             windows = {}
-            self._add(windows, MapKey(self.number, (name,)), 0, 0, 0, 1.0, y_blocks)
+            key = MASS if name == EXTRAS[0] else MapKey(self.number, (name,))
+            self._add(windows, key, 0, 0, 0, 1.0, y_blocks)
             self.entries.append(list(windows.items()))
         # The wide planes of one set stand together.
         ordered = [(s, e) for s in self.sets for e in range(self.sets[s] + 1) if (s, e) in self.wides]
@@ -105,6 +107,7 @@ class Windows:
         return list(dict.fromkeys(b for s in self.sets for b in self.sources(s)))
 
 
+@functools.cache
 def block_weights(blocks: Blocks, power: int) -> Array:
     """Weights of the samples of a block in the sum of ``δ^power p``."""
     return np.asarray(np.array(blocks.shape) * blocks.inner**power)

@@ -1,0 +1,244 @@
+"""Filters, products and windows, tile by tile of columns: see ``kernels.moments`` for the formulas; for CPUs.
+
+A task does all steps for one row of a tile before it turns to the next one: what lies between the steps stays in its
+scratch, and that in the cache.
+"""
+
+import functools
+
+from leafflow_ti.kernels.engine import lane_kernel, lane_type, ti
+from leafflow_ti.kernels.moments import BLOCK, POWERS, Step, formulas
+from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
+
+
+@functools.cache
+def tile_kernel(spec: KernelSpec):
+    """All steps from raw frames to the maps of one frame, tile by tile of columns; for CPUs.
+
+    ``steps`` [n_steps, Step.N]: the first ``n_raw`` read raw frames, the last one writes maps. Those before ``n_early`` run
+    ``2 halo`` rows ahead of those behind it; the last one runs when the ``length`` rows of a block of maps are there.
+    """
+    linear, products, _ = formulas(spec)
+    V = lane_type(spec.real, spec.lanes)
+
+    @lane_kernel(spec.lanes)
+    def filter_tiles(
+        n_steps: ti.i32,
+        n_raw: ti.i32,
+        n_early: ti.i32,
+        n_tiles: ti.i32,
+        n_tasks: ti.i32,
+        raw_row: ti.i32,  # distance of the rows of raw frames
+        n_rows: ti.i32,  # rows of maps before they are summed over blocks
+        halo: ti.i32,
+        oldest: ti.i32,  # slot of the oldest raw frame
+        block: ti.i32,
+        length: ti.i32,
+        map_tile: ti.i32,  # columns of maps that a tile makes
+        maps_at: ti.i32,
+        scratch_size: ti.i32,
+        invalid: ti.i32,  # place of the count of invalid pixels
+        steps: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        first: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of linear passes, [n_outputs + 1]
+        column: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], of a row of scratch
+        n_blocks: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], times BLOCK columns
+        trim: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], rows that are not needed at both ends
+        offset: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        ring: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        weight: ti.types.ndarray(dtype=spec.real, ndim=1),
+        group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_groups + 1]
+        one: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_pairs]
+        two: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        factor: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_pairs, POWERS]
+        constant: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_groups]
+        inner: ti.i32,  # first column of products in a row of scratch
+        inner_blocks: ti.i32,
+        raw: ti.types.ndarray(dtype=V, ndim=1),
+        scratch: ti.types.ndarray(dtype=V, ndim=1),
+        maps: ti.types.ndarray(dtype=V, ndim=1),
+    ):
+        for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
+            if part == 0:
+                home = task * scratch_size
+                for t in range(task * n_tiles // n_tasks, (task + 1) * n_tiles // n_tasks):
+                    for i in range(n_rows + 2 * halo):
+                        last = n_steps - 1
+                        raw_at = (t * (n_rows + 2 * halo) + i) * raw_row
+                        for s in range(n_raw):
+                            at = s * Step.N
+                            place = home + steps[at + Step.TARGET]
+                            place += (i % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
+                            for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
+                                if i >= trim[o] and i < n_rows + 2 * halo - trim[o]:
+                                    to = place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE]
+                                    for c in range(n_blocks[o]):
+                                        x = column[o] + BLOCK * c
+                                        linear(
+                                            o, raw_at + x, 1, oldest, steps[at + Step.SLOTS], steps[at + Step.HOP],
+                                            to + x, first, offset, ring, weight, raw, scratch,
+                                        )  # fmt: skip
+                        until = n_early
+                        if i >= 2 * halo:
+                            until = last
+                        for s in range(n_raw, until):
+                            at = s * Step.N
+                            # Steps behind the early ones work on the row that all their rows are there for.
+                            row = i
+                            if s >= n_early:
+                                row = i - 2 * halo
+                            if steps[at + Step.PRODUCTS] == 1:
+                                plane = steps[at + Step.TARGET_PLANE]
+                                place = home + steps[at + Step.TARGET] + inner
+                                for c in range(inner_blocks):
+                                    for g in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
+                                        products(
+                                            g, home + inner + BLOCK * c, invalid,
+                                            place + (g - steps[at + Step.FIRST]) * POWERS * plane + BLOCK * c, plane,
+                                            group, one, two, factor, constant, scratch, scratch,
+                                        )  # fmt: skip
+                            else:
+                                top = row % steps[at + Step.SLOTS]
+                                gap = steps[at + Step.COLUMN_STEP]
+                                place = home + steps[at + Step.TARGET]
+                                place += (row % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
+                                # Few columns of all outputs at a time: their sources are then in the nearest cache.
+                                for c in range(steps[at + Step.BLOCKS]):
+                                    for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
+                                        seen = s >= n_early or (i >= trim[o] and i < n_rows + 2 * halo - trim[o])
+                                        if seen and c < n_blocks[o]:
+                                            x = column[o] + BLOCK * c
+                                            linear(
+                                                o, home + x * gap, gap, top, steps[at + Step.SLOTS],
+                                                steps[at + Step.HOP],
+                                                place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE] + x,
+                                                first, offset, ring, weight, scratch, scratch,
+                                            )  # fmt: skip
+                        begin = i - 2 * halo - (length - 1)
+                        if begin >= 0 and begin % block == 0:
+                            at = last * Step.N
+                            place = maps_at + t * map_tile + begin // block * steps[at + Step.TARGET_HOP]
+                            for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
+                                to = place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE]
+                                for c in range(n_blocks[o]):
+                                    x = BLOCK * c
+                                    linear(
+                                        o, home + x, 1, begin % steps[at + Step.SLOTS], steps[at + Step.SLOTS],
+                                        steps[at + Step.HOP], to + x,
+                                        first, offset, ring, weight, scratch, maps,
+                                    )  # fmt: skip
+
+    return filter_tiles
+
+
+@functools.cache
+def across_kernel(spec: KernelSpec):
+    """Sums over the frames of the window, then windows along x; for CPUs.
+
+    A *set* is the maps that the same wide planes are made of: ``sums[set]`` to ``sums[set + 1] - 1`` are its sums over
+    frames, ``wides[set]`` to ``wides[set + 1] - 1`` its planes. ``wide`` [plane, strip, row, lanes]: strips of ``lanes``
+    columns, so that the lanes of the windows along y are neighbours in x.
+    """
+    linear, _, window = formulas(spec)
+    V = lane_type(spec.real, spec.lanes)
+    lanes = spec.lanes
+
+    @lane_kernel(lanes)
+    def across(
+        n_sets: ti.i32,
+        n_tasks: ti.i32,
+        segment: ti.i32,  # rows of maps per lane
+        rows: ti.i32,
+        pitch: ti.i32,  # of maps
+        cols: ti.i32,  # output columns
+        step: ti.i32,  # columns of maps per output column
+        taps: ti.i32,
+        strips: ti.i32,
+        oldest: ti.i32,
+        n_slots: ti.i32,
+        slot_size: ti.i32,
+        source_pitch: ti.i32,
+        scratch_size: ti.i32,
+        sums: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        wides: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        first: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        offset: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        ring: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        weight: ti.types.ndarray(dtype=spec.real, ndim=1),
+        wide_first: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        wide_offset: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        table: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        tap: ti.types.ndarray(dtype=spec.real, ndim=1),
+        maps: ti.types.ndarray(dtype=V, ndim=1),
+        scratch: ti.types.ndarray(dtype=V, ndim=1),
+        numbers: ti.types.ndarray(dtype=spec.real, ndim=1),  # scratch once more
+        wide: ti.types.ndarray(dtype=spec.real, ndim=1),
+    ):
+        for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
+            if part == 0:
+                n_items = segment * n_sets
+                result = (task + 1) * scratch_size - strips * lanes
+                for item in range(task * n_items // n_tasks, (task + 1) * n_items // n_tasks):
+                    j = item // n_sets
+                    g = item - j * n_sets
+                    for s in range(sums[g], sums[g + 1]):
+                        to = task * scratch_size + (s - sums[g]) * source_pitch
+                        for c in range(((cols - 1) * step + taps + BLOCK - 1) // BLOCK):
+                            linear(
+                                s, j * pitch + BLOCK * c, 1, oldest, n_slots, slot_size, to + BLOCK * c,
+                                first, offset, ring, weight, maps, scratch,
+                            )  # fmt: skip
+                    for w in range(wides[g], wides[g + 1]):
+                        for c in range((cols + BLOCK - 1) // BLOCK):
+                            window(
+                                w, task * scratch_size + BLOCK * c * step, step, 1, taps, result + BLOCK * c, 1, BLOCK,
+                                wide_first, wide_offset, table, tap, scratch, scratch,
+                            )  # fmt: skip
+                        for strip in range(strips):
+                            begin = (result + strip * lanes) * lanes
+                            for lane in range(lanes):
+                                row = lane * segment + j
+                                if row < rows:
+                                    to = ((w * strips + strip) * rows + row) * lanes
+                                    for x in range(lanes):
+                                        wide[to + x] = numbers[begin + x * lanes + lane]
+
+    return across
+
+
+@functools.cache
+def down_kernel(spec: KernelSpec):
+    """Windows along y: ``wide`` [plane, strip, row, lanes] to a tensor [plane, row, pitch]; for CPUs."""
+    _, _, window = formulas(spec)
+    V = lane_type(spec.real, spec.lanes)
+
+    @lane_kernel(spec.lanes)
+    def down(
+        n_planes: ti.i32,
+        n_tasks: ti.i32,
+        rows_in: ti.i32,
+        rows: ti.i32,
+        step: ti.i32,
+        taps: ti.i32,
+        strips: ti.i32,
+        pitch: ti.i32,  # of the tensor, in vectors
+        first: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        offset: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        table: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        tap: ti.types.ndarray(dtype=spec.real, ndim=1),
+        wide: ti.types.ndarray(dtype=V, ndim=1),
+        tensor: ti.types.ndarray(dtype=V, ndim=1),
+    ):
+        for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
+            if part == 0:
+                n_items = n_planes * strips
+                for item in range(task * n_items // n_tasks, (task + 1) * n_items // n_tasks):
+                    o = item // strips
+                    strip = item - o * strips
+                    for c in range((rows + BLOCK - 1) // BLOCK):
+                        row = BLOCK * c
+                        window(
+                            o, strip * rows_in + row * step, step, 1, taps, (o * rows + row) * pitch + strip, pitch,
+                            rows - row, first, offset, table, tap, wide, tensor,
+                        )  # fmt: skip
+
+    return down
