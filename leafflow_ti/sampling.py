@@ -39,19 +39,19 @@ class Blocks:
     @property
     def inner(self) -> Array:
         """Offsets of a block's samples from its middle."""
-        return np.arange(self.length) - (self.length - 1) / 2
+        return np.asarray(np.arange(self.length) - (self.length - 1) / 2, np.float64)
 
     @property
     def centres(self) -> Array:
         """Offsets of the blocks' middles from that of the window."""
-        return self.step * (np.arange(len(self.weights)) - (len(self.weights) - 1) / 2)
+        return np.asarray(self.step * (np.arange(len(self.weights)) - (len(self.weights) - 1) / 2), np.float64)
 
     @classmethod
     def of(cls, size: int, moment: float, stride: int) -> Blocks | None:
         """Blocks for outputs at distance ``stride`` in place of a window of ``size`` samples; None: no such blocks.
 
         ``step`` is the largest divisor of ``stride`` that leaves ``LEAST_BLOCKS`` across the window. Their number is
-        the one whose window is nearest to ``size`` in length (the shorter of two): within ``(step + 1) / 2`` samples of it.
+        the one whose window is nearest to ``size`` in length (the shorter of two): within ``(step + 1) / 2`` samples.
         Weights are those of a Gaussian at the middles of the blocks, its σ such that the second moment of the window
         is ``moment``, or else as near to it as its length allows.
         """

@@ -20,6 +20,8 @@ from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
 BLOCK = 4
 """Neighbouring outputs that a CPU makes from one look at the tables; loads of windows are shared by as many."""
+TILES = 4
+"""Neighbouring tiles that raw rows are handed out to at a time."""
 POWERS = 3
 """Weights of a term of products, hence sums that a group of products makes."""
 
@@ -126,13 +128,13 @@ def formulas(spec: KernelSpec):
                     u0 += w0 * q
                     u1 += w1 * q
                     u2 += w2 * q
-            seen = ti.select(src[here + invalid] > half, zero(), full)
+            seen = ti.select(src[invalid + 2 * pair] > half, zero(), full)
             place = to + 2 * pair
             dst[place] = seen * s0
             dst[place + plane] = seen * s1
             dst[place + 2 * plane] = seen * s2
             if ti.static(block > 1):
-                seen = ti.select(src[here + 1 + invalid] > half, zero(), full)
+                seen = ti.select(src[invalid + 2 * pair + 1] > half, zero(), full)
                 dst[place + 1] = seen * u0
                 dst[place + 1 + plane] = seen * u1
                 dst[place + 1 + 2 * plane] = seen * u2
@@ -190,25 +192,6 @@ def arrange_kernel(spec: KernelSpec):
     """
     lanes = spec.lanes
 
-    @ti.func
-    def one_row(
-        begin: ti.i32,  # of the image in src
-        j: ti.i32,
-        first: ti.i32,
-        last: ti.i32,
-        rows: ti.i32,
-        cols: ti.i32,
-        segment: ti.i32,
-        to: ti.i32,
-        src: ti.template(),
-        dst: ti.template(),
-    ):
-        for lane in range(lanes):
-            at = begin + ti.min(lane * segment + j, rows - 1) * cols + first
-            place = to * lanes + lane
-            for x in range(last - first):
-                dst[place + x * lanes] = src[at + x]
-
     @ti.kernel
     def arrange(
         n_images: ti.i32,
@@ -226,14 +209,12 @@ def arrange_kernel(spec: KernelSpec):
         dst_out: ti.types.ndarray(dtype=spec.real, ndim=1),  # vectors [to + n_tiles * tall * images * width]
     ):
         if ti.static(spec.gpu):
-            for g in range(n_images * tall * cols):
+            for g in range(n_images * rows * cols):
                 line = g // cols
-                x = g - line * cols
-                j = line // n_images
-                n = line - j * n_images
-                one_row(
-                    n * rows * cols, j, x, x + 1, rows, cols, segment, to + (j * images + n) * width + x, src_in, dst_out
-                )
+                n = line // rows
+                row = line - n * rows
+                if row < tall:
+                    dst_out[to + (row * images + n) * width + g - line * cols] = src_in[g]
         else:
             for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
                 if part == 0:
@@ -241,10 +222,14 @@ def arrange_kernel(spec: KernelSpec):
                     for line in range(task * n_lines // n_tasks, (task + 1) * n_lines // n_tasks):
                         n = line // tall
                         j = line - n * tall
-                        for tile in range(n_tiles):
-                            one_row(
-                                n * rows * cols, j, tile * step, ti.min(tile * step + width, cols), rows, cols, segment,
-                                to + ((tile * tall + j) * images + n) * width, src_in, dst_out,
-                            )  # fmt: skip
+                        # Some tiles at a time: vectors are in the cache while their lanes are written one by one.
+                        for some in range((n_tiles + TILES - 1) // TILES):
+                            for lane in range(lanes):
+                                begin = (n * rows + ti.min(lane * segment + j, rows - 1)) * cols
+                                for tile in range(some * TILES, ti.min((some + 1) * TILES, n_tiles)):
+                                    at = begin + tile * step
+                                    place = (to + ((tile * tall + j) * images + n) * width) * lanes + lane
+                                    for x in range(ti.min(width, cols - tile * step)):
+                                        dst_out[place + x * lanes] = src_in[at + x]
 
     return arrange

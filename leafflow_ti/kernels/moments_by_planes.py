@@ -77,7 +77,7 @@ def products_kernel(spec: KernelSpec):
             g = h // (rows * pitch)
             pixel = h - g * (rows * pitch)
             products(
-                begin + g, pixel, invalid, to + g * POWERS * plane + pixel, plane,
+                begin + g, pixel, pixel + invalid, to + g * POWERS * plane + pixel, plane,
                 group, one, two, factor, constant, scratch, scratch,
             )  # fmt: skip
 

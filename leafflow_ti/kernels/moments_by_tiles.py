@@ -15,11 +15,67 @@ from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 def tile_kernel(spec: KernelSpec):
     """All steps from raw frames to the maps of one frame, tile by tile of columns; for CPUs.
 
-    ``steps`` [n_steps, Step.N]: the first ``n_raw`` read raw frames, the last one writes maps. Those before ``n_early`` run
-    ``2 halo`` rows ahead of those behind it; the last one runs when the ``length`` rows of a block of maps are there.
+    ``steps`` [n_steps, Step.N]: the first ``n_raw`` read raw frames, the last one writes maps. Those before ``n_early``
+    run ``2 halo`` rows ahead of the others; the last one runs when the ``length`` rows of a block of maps are there.
     """
     linear, products, _ = formulas(spec)
     V = lane_type(spec.real, spec.lanes)
+
+    @ti.func
+    def linear_step(
+        at: ti.i32,  # of the step in ``steps``
+        early: ti.i32,  # rows before this one and behind it that are worked on; less than 0: all outputs are wanted
+        late: ti.i32,
+        stretch: ti.i32,  # blocks of one output that are made before those of the next
+        source: ti.i32,
+        top: ti.i32,
+        target: ti.i32,
+        steps: ti.template(),
+        first: ti.template(),
+        column: ti.template(),
+        n_blocks: ti.template(),
+        trim: ti.template(),
+        offset: ti.template(),
+        ring: ti.template(),
+        weight: ti.template(),
+        src: ti.template(),
+        dst: ti.template(),
+    ):
+        gap = steps[at + Step.COLUMN_STEP]
+        for part in range((steps[at + Step.BLOCKS] + stretch - 1) // stretch):
+            for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
+                if early < 0 or (early >= trim[o] and late >= trim[o]):
+                    to = target + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE]
+                    for c in range(part * stretch, ti.min((part + 1) * stretch, n_blocks[o])):
+                        x = column[o] + BLOCK * c
+                        linear(
+                            o, source + x * gap, gap, top, steps[at + Step.SLOTS], steps[at + Step.HOP], to + x,
+                            first, offset, ring, weight, src, dst,
+                        )  # fmt: skip
+
+    @ti.func
+    def product_step(
+        at: ti.i32,
+        home: ti.i32,
+        inner: ti.i32,
+        inner_blocks: ti.i32,
+        invalid: ti.i32,
+        steps: ti.template(),
+        group: ti.template(),
+        one: ti.template(),
+        two: ti.template(),
+        factor: ti.template(),
+        constant: ti.template(),
+        scratch: ti.template(),
+    ):
+        plane = steps[at + Step.TARGET_PLANE]
+        for c in range(inner_blocks):
+            x = inner + BLOCK * c
+            for g in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
+                to = home + steps[at + Step.TARGET] + (g - steps[at + Step.FIRST]) * POWERS * plane + x
+                products(
+                    g, home + x, home + x + invalid, to, plane, group, one, two, factor, constant, scratch, scratch
+                )
 
     @lane_kernel(spec.lanes)
     def filter_tiles(
@@ -60,72 +116,48 @@ def tile_kernel(spec: KernelSpec):
         for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
             if part == 0:
                 home = task * scratch_size
+                last = (n_steps - 1) * Step.N
+                tall = n_rows + 2 * halo
                 for t in range(task * n_tiles // n_tasks, (task + 1) * n_tiles // n_tasks):
-                    for i in range(n_rows + 2 * halo):
-                        last = n_steps - 1
-                        raw_at = (t * (n_rows + 2 * halo) + i) * raw_row
+                    for i in range(tall):
                         for s in range(n_raw):
                             at = s * Step.N
-                            place = home + steps[at + Step.TARGET]
-                            place += (i % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
-                            for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
-                                if i >= trim[o] and i < n_rows + 2 * halo - trim[o]:
-                                    to = place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE]
-                                    for c in range(n_blocks[o]):
-                                        x = column[o] + BLOCK * c
-                                        linear(
-                                            o, raw_at + x, 1, oldest, steps[at + Step.SLOTS], steps[at + Step.HOP],
-                                            to + x, first, offset, ring, weight, raw, scratch,
-                                        )  # fmt: skip
+                            to = home + steps[at + Step.TARGET]
+                            to += (i % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
+                            # Raw frames come from far away, in long stretches; scratch from a near cache, where a few
+                            # columns of all sources stay in the nearest one while all outputs are made of them.
+                            linear_step(
+                                at, i, tall - 1 - i, steps[at + Step.BLOCKS], (t * tall + i) * raw_row, oldest, to,
+                                steps, first, column, n_blocks, trim, offset, ring, weight, raw, scratch,
+                            )  # fmt: skip
                         until = n_early
                         if i >= 2 * halo:
-                            until = last
+                            until = n_steps - 1
                         for s in range(n_raw, until):
                             at = s * Step.N
-                            # Steps behind the early ones work on the row that all their rows are there for.
-                            row = i
+                            # Steps behind the early ones work on the row that all they look at is there for.
+                            row, early = i, i
                             if s >= n_early:
-                                row = i - 2 * halo
+                                row, early = i - 2 * halo, -1
                             if steps[at + Step.PRODUCTS] == 1:
-                                plane = steps[at + Step.TARGET_PLANE]
-                                place = home + steps[at + Step.TARGET] + inner
-                                for c in range(inner_blocks):
-                                    for g in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
-                                        products(
-                                            g, home + inner + BLOCK * c, invalid,
-                                            place + (g - steps[at + Step.FIRST]) * POWERS * plane + BLOCK * c, plane,
-                                            group, one, two, factor, constant, scratch, scratch,
-                                        )  # fmt: skip
+                                product_step(
+                                    at, home, inner, inner_blocks, invalid, steps,
+                                    group, one, two, factor, constant, scratch,
+                                )  # fmt: skip
                             else:
-                                top = row % steps[at + Step.SLOTS]
-                                gap = steps[at + Step.COLUMN_STEP]
-                                place = home + steps[at + Step.TARGET]
-                                place += (row % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
-                                # Few columns of all outputs at a time: their sources are then in the nearest cache.
-                                for c in range(steps[at + Step.BLOCKS]):
-                                    for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
-                                        seen = s >= n_early or (i >= trim[o] and i < n_rows + 2 * halo - trim[o])
-                                        if seen and c < n_blocks[o]:
-                                            x = column[o] + BLOCK * c
-                                            linear(
-                                                o, home + x * gap, gap, top, steps[at + Step.SLOTS],
-                                                steps[at + Step.HOP],
-                                                place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE] + x,
-                                                first, offset, ring, weight, scratch, scratch,
-                                            )  # fmt: skip
+                                to = home + steps[at + Step.TARGET]
+                                to += (row % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
+                                linear_step(
+                                    at, early, tall - 1 - i, 1, home, row % steps[at + Step.SLOTS], to,
+                                    steps, first, column, n_blocks, trim, offset, ring, weight, scratch, scratch,
+                                )  # fmt: skip
                         begin = i - 2 * halo - (length - 1)
                         if begin >= 0 and begin % block == 0:
-                            at = last * Step.N
-                            place = maps_at + t * map_tile + begin // block * steps[at + Step.TARGET_HOP]
-                            for o in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
-                                to = place + (o - steps[at + Step.FIRST]) * steps[at + Step.TARGET_PLANE]
-                                for c in range(n_blocks[o]):
-                                    x = BLOCK * c
-                                    linear(
-                                        o, home + x, 1, begin % steps[at + Step.SLOTS], steps[at + Step.SLOTS],
-                                        steps[at + Step.HOP], to + x,
-                                        first, offset, ring, weight, scratch, maps,
-                                    )  # fmt: skip
+                            to = maps_at + t * map_tile + begin // block * steps[last + Step.TARGET_HOP]
+                            linear_step(
+                                last, -1, 0, 1, home, begin % steps[last + Step.SLOTS], to,
+                                steps, first, column, n_blocks, trim, offset, ring, weight, scratch, maps,
+                            )  # fmt: skip
 
     return filter_tiles
 
@@ -135,8 +167,8 @@ def across_kernel(spec: KernelSpec):
     """Sums over the frames of the window, then windows along x; for CPUs.
 
     A *set* is the maps that the same wide planes are made of: ``sums[set]`` to ``sums[set + 1] - 1`` are its sums over
-    frames, ``wides[set]`` to ``wides[set + 1] - 1`` its planes. ``wide`` [plane, strip, row, lanes]: strips of ``lanes``
-    columns, so that the lanes of the windows along y are neighbours in x.
+    frames, ``wides[set]`` to ``wides[set + 1] - 1`` its planes. ``wide`` [plane, strip, row, lanes]: strips of
+    ``lanes`` columns, so that the lanes of the windows along y are neighbours in x.
     """
     linear, _, window = formulas(spec)
     V = lane_type(spec.real, spec.lanes)

@@ -25,6 +25,8 @@ EXTRA_PLANES = 4
 """Behind the tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
 POWERS = 3
 """Sums that are made of the same products at a time; the same number as ``kernels.moments.POWERS``."""
+UNROLLED = 4
+"""Outputs that a CPU kernel makes at a time; the same number as ``kernels.moments.BLOCK``."""
 INVALID, FACTOR = -1, -2
 """In the place of an image's row: the plane of invalid pixels, factor planes."""
 CAMERA_AXES = ("sy", "sx")
@@ -174,7 +176,8 @@ class Channels:
                     w = tuple(float(sampling.sy.window(p)[iy] * sampling.sx.window(q)[ix]) for p, q in some)
                     where = (centre[0] + iy - half[0], centre[1] + ix - half[1])
                     if any(w):
-                        group.pairs.append((self._operand(request, what[0], where), self._operand(request, what[1], where)))
+                        operands = [self._operand(request, channel, where) for channel in what]
+                        group.pairs.append((operands[0], operands[1]))
                         group.weights.append(w)
                 self.groups.append(group)
         gx, gy = (self.channel(request, a, *centre) for a in ("x", "y"))
@@ -234,14 +237,15 @@ class Channels:
         if known is not None:
             return known
         kernel = self.kernel(axis, getattr(plane, axis))
-        source = Plane(*("" if name == axis else value for name, value in zip(Plane._fields, plane, strict=True)))
+        names = ["" if a == axis else name for a, name in zip(Plane._fields[2:], plane[2:], strict=True)]
+        source = Plane(plane.row, plane.col, *names)
         found = []
         for i, w in enumerate(kernel.tolist()):
             shift = i - len(kernel) // 2
             if w and axis == "sy":
-                found.append((Plane(plane.row + shift, *source[1:]), 0, w))
+                found.append((Plane(plane.row + shift, plane.col, *names), 0, w))
             elif w and axis == "sx":
-                found.append((Plane(plane.row, plane.col + shift, *source[2:]), 0, w))
+                found.append((Plane(plane.row, plane.col + shift, *names), 0, w))
             elif w:
                 found.append((source, shift, w))
         self._terms[axis, plane] = found

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from leafflow_ti.models import ColumnSet, TensorLayout
 from leafflow_ti.runtime import MOMENT_LANES, Device
 from leafflow_ti.sampling import Sampling
-from leafflow_ti.stages.channels import EXTRA_PLANES, FACTOR_PLANES, Channels, Request
+from leafflow_ti.stages.channels import EXTRA_PLANES, FACTOR_PLANES, UNROLLED, Channels, Request
 from leafflow_ti.stages.planes import Terms
 from leafflow_ti.stages.tensor_tables import Band, Lowered, padded_tables
 from leafflow_ti.stages.windows import Windows, taps
@@ -42,7 +42,7 @@ class TensorStage:
     ``push`` takes one frame's block [n_sy, n_sx, in_rows, in_cols] (preshifted) of the cameras that the sampling and
     the ``own`` requests need, and its validity. Once the window is full it returns the packed tensor [n_entries +
     EXTRA_PLANES, rows, out_pitch] as a flat device array; ``tensors`` holds it and those of the own requests, valid
-    until the next call. For ``derived`` columns the block is a stack of images [1, n_images, ...] with its factor planes.
+    until the next call. For ``derived`` columns the block is a stack of images [1, n_images, ...] with its factors.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class TensorStage:
         self.n_taps = 2 * sampling.t.filter_radius + 1
         geometry = lowered.geometry
         self.out_pitch = geometry.out_pitch
-        self._n_tiling = max(1, min(geometry.n_tiles, 2 * device.threads))
+        self._n_tiling = max(1, min(geometry.n_tiles, 4 * device.threads))
         lanes = geometry.lanes
         sizes = lowered.sizes(self._n_tiling, 8 * device.threads)
         self._raw, self._scratch, self._maps, self._sums, self._wide = (self._zeros(n * lanes) for n in sizes[:5])
@@ -103,7 +103,9 @@ class TensorStage:
         lowered, array, t = self._lowered, self.device.array, self.sampling.t
         g = lowered.geometry
         number = {b: n for n, b in enumerate(lowered.block_maps)}
-        sums, first_sum, first_wide, across = [], [0], [0], []
+        sums: list[list[tuple[tuple[int, int], float]]] = []
+        across: list[list[tuple[int, NDArray[np.float64]]]] = []
+        first_sum, first_wide = [0], [0]
         for wide_set in windows.sets:
             weights = t.window(wide_set.t).tolist()
             begin = len(sums)
@@ -188,12 +190,11 @@ class TensorStage:
 
         device, lowered = self.device, self._lowered
         g = lowered.geometry
-        steps, first, column, blocks, trim, offset, ring, weight, *products = self._filter_tables
+        arrays = (device.vectors(a, g.lanes) for a in (self._raw, self._scratch, self._maps))
         tile_kernel(device.moments)(
-            len(lowered.steps), lowered.n_raw, lowered.n_early, g.n_tiles, self._n_tiling, lowered.raw_row, g.map_rows, g.halo[0],
-            self._pushed % self.n_taps, g.y.step, g.y.length, g.map_tile, maps_at, lowered.scratch, lowered.invalid,
-            steps, first, column, blocks, trim, offset, ring, weight, *products,
-            g.halo[1], -(-g.inner // 4), *(device.vectors(a, g.lanes) for a in (self._raw, self._scratch, self._maps)),
+            len(lowered.steps), lowered.n_raw, lowered.n_early, g.n_tiles, self._n_tiling, lowered.raw_row,
+            g.map_rows, g.halo[0], self._pushed % self.n_taps, g.y.step, g.y.length, g.map_tile, maps_at,
+            lowered.scratch, lowered.invalid, *self._filter_tables, g.halo[1], -(-g.inner // UNROLLED), *arrays,
         )  # fmt: skip
 
     def _make_tensor(self, number: int) -> None:

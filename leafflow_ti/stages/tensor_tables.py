@@ -9,19 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.sampling import Sampling
-from leafflow_ti.stages.channels import POWERS, Channels, MapKey, Pass, Plane
+from leafflow_ti.stages.channels import POWERS, UNROLLED, Channels, MapKey, Pass, Plane
 from leafflow_ti.stages.planes import Terms, round_up
-from leafflow_ti.stages.windows import BlockMap, Windows, block_weights, taps, x_powers
+from leafflow_ti.stages.windows import Windows, block_weights, taps, x_powers
 
 Ints = list[int]
-UNROLLED = 4
-"""Outputs that a CPU kernel makes at a time; the same number as ``kernels.moments.BLOCK``."""
 ALL_ROWS = 1 << 30
 """Slots of what keeps every row."""
-SCRATCH_BYTES = 1 << 22
-"""Of one task on the CPU, so that it stays in a core's cache."""
-TILE = 64
-"""Columns of a tile where that fits into the scratch."""
+SCRATCH_BYTES = 1 << 20
+"""Of one task on the CPU, in single precision, so that it stays in a core's second cache."""
+WIDEST, NARROWEST = 64, 8
+"""Columns of a tile: as many as the scratch has room for."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +106,10 @@ class Geometry:
         self.map_rows = (self.block_segment - 1) * self.y.step + self.y.length
         self.tall = self.map_rows + 2 * halo[0]
         whole = round_up(self.block_cols, UNROLLED)
-        self.map_tile = whole if lanes == 1 else min(whole, round_up(max(1, tile // self.x.step), UNROLLED))
-        self.n_tiles = -(-self.block_cols // self.map_tile)
+        widest = whole if lanes == 1 else round_up(max(1, tile // self.x.step), UNROLLED)
+        # Tiles of equal width: the last one should not be a sliver.
+        self.n_tiles = -(-whole // widest)
+        self.map_tile = round_up(-(-whole // self.n_tiles), UNROLLED)
         self.map_pitch = self.n_tiles * self.map_tile
         self.map_plane = self.block_segment * self.map_pitch
         self.tile = self.map_tile * self.x.step
@@ -124,13 +124,11 @@ class Lowered:
     def __init__(self, channels: Channels, windows: list[Windows], band: Band, lanes: int):
         self.channels, self.windows, self.band = channels, windows, band
         self.gpu = lanes == 1
-        tile = TILE
-        while True:
-            self.geometry = Geometry(channels.sampling, band, channels.halo, lanes, tile)
-            self._lay_out()
-            if self.gpu or tile <= 8 or 4 * lanes * self.scratch <= SCRATCH_BYTES:
-                break
+        tile = WIDEST
+        self._lay_out(Geometry(channels.sampling, band, channels.halo, lanes, tile))
+        while not self.gpu and tile > NARROWEST and 4 * lanes * self.scratch > SCRATCH_BYTES:
             tile //= 2
+            self._lay_out(Geometry(channels.sampling, band, channels.halo, lanes, tile))
 
     def _region(self, n: int, early: bool, slots: int = 1, width: int | None = None) -> Region:
         """Room for ``n`` planes, of which a CPU keeps ``slots`` rows."""
@@ -153,14 +151,11 @@ class Lowered:
             self._n_linear += n
         slots, hop = (source.slots, source.hop) if source else (1, 0)
         widest = 0 if products else max(self.linear.blocks[first : first + n])
-        self.steps.append(
-            [
-                products, first, first + n, slots, hop, column_step, target.base, target.plane, target.slots, target.hop,
-                widest,
-            ]
-        )  # fmt: skip
+        outputs = [target.base, target.plane, target.slots, target.hop]
+        self.steps.append([products, first, first + n, slots, hop, column_step, *outputs, widest])
 
-    def _lay_out(self) -> None:
+    def _lay_out(self, geometry: Geometry) -> None:
+        self.geometry = geometry
         # Filters look a little to the left of what a tile needs: room for that before the first plane.
         self.scratch = self.geometry.width if self.gpu else 0
         self.steps: list[Ints] = []
@@ -172,14 +167,15 @@ class Lowered:
     def _lay_out_filters(self) -> dict[Plane, int]:
         """Steps of the passes along t, y, x and the camera axes; the places of the channels.
 
-        What the pass along y reads is kept for the rows from the first that it looks at to the newest one, all else for the
-        row that is worked on.
+        What the pass along y reads is kept for the rows from the first that it looks at to the newest one, all else
+        for the row that is worked on.
         """
         channels = self.channels
         active = [p for p in channels.passes if p.axis in "ty" or any(getattr(o, p.axis) != "1" for o in p.outputs)]
         y = [p.axis for p in active].index("y")
         reaches = [ry for ry, _ in active[y - 1].outputs.values()]
-        rings = {ry: self._region(reaches.count(ry), True, self.geometry.halo[0] + ry + 1) for ry in sorted(set(reaches))}
+        halo = self.geometry.halo[0]
+        rings = {ry: self._region(reaches.count(ry), True, halo + ry + 1) for ry in sorted(set(reaches))}
         base = end = self.scratch
         raw = Region(0, 0, 2 * channels.sampling.t.filter_radius + 1, self.frame_size)
         places: dict[Plane, tuple[int, Region]] = {}
@@ -243,7 +239,7 @@ class Lowered:
                 operands[name] = target.at(POWERS * n)
             self._step(len(pairs), None, target, products=1)
         target = self._region(POWERS * len(channels.groups), False)
-        maps = {}
+        maps: dict[MapKey, int] = {}
         for n, group in enumerate(channels.groups):
             weights = [w + (0.0,) * (POWERS - len(w)) for w in group.weights]
             groups.append(([(operands[a], operands[b]) for a, b in group.pairs], weights, group.constant))

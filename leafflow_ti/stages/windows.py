@@ -37,6 +37,10 @@ class WideSet(NamedTuple):
     t: int
 
 
+Wide = tuple[WideSet, int]
+"""A wide plane: its set, and the power of x that it is a moment of."""
+
+
 def power_table(blocks: Blocks, power: int, inner: int) -> Array:
     """Window weights over blocks of the sums of ``δ^inner`` in a moment of ``power``."""
     found = math.comb(power, inner) * np.array(blocks.weights) * blocks.centres ** (power - inner)
@@ -54,14 +58,14 @@ class Windows:
     request: Request
     number: int
     sets: dict[WideSet, int] = field(default_factory=dict)
-    wides: dict[tuple[WideSet, int], int] = field(default_factory=dict)
-    entries: list[list[tuple[tuple[WideSet, int], Array]]] = field(default_factory=list)
+    wides: dict[Wide, int] = field(default_factory=dict)
+    entries: list[list[tuple[Wide, Array]]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         at = {a: AXES.index(a) for a in AXES}
         y_blocks = self.request.sampling.y.blocked
         for entry in self.request.layout.entries:
-            windows: dict[tuple[WideSet, int], Array] = {}
+            windows: dict[Wide, Array] = {}
             for moment, factor in entry:
                 e = moment.exponents
                 key = MapKey(self.number, moment.channels, (e[at["sy"]], e[at["sx"]]))
@@ -77,7 +81,7 @@ class Windows:
         self.wides = {w: i for i, w in enumerate(ordered)}
 
     def _add(
-        self, windows: dict[tuple[WideSet, int], Array], key: MapKey, t: int, x: int, y: int, factor: float, blocks: Blocks
+        self, windows: dict[Wide, Array], key: MapKey, t: int, x: int, y: int, factor: float, blocks: Blocks
     ) -> None:
         for n in range(y + 1) if blocks.length > 1 else (0,):
             wide_set = WideSet(key, n, t)
@@ -91,7 +95,7 @@ class Windows:
         last = self.sets[wide_set] if self.request.sampling.x.blocked.length > 1 else 0
         return [BlockMap(wide_set.key, i, wide_set.y) for i in range(last + 1)]
 
-    def across(self, wide: tuple[WideSet, int]) -> list[tuple[int, Array]]:
+    def across(self, wide: Wide) -> list[tuple[int, Array]]:
         """Windows along x of a wide plane: numbers of sources and weights."""
         blocks = self.request.sampling.x.blocked
         return [(i, power_table(blocks, wide[1], i)) for i in range(wide[1] + 1 if blocks.length > 1 else 1)]
