@@ -206,7 +206,7 @@ def arrange_kernel(spec: KernelSpec):
         to: ti.i32,
         n_tasks: ti.i32,
         src_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_images * rows * cols]
-        dst_out: ti.types.ndarray(dtype=spec.real, ndim=1),  # vectors [to + n_tiles * tall * images * width]
+        dst_out: ti.types.ndarray(dtype=spec.real, ndim=1),  # [to + n_tiles * tall * images * width, lanes]
     ):
         if ti.static(spec.gpu):
             for g in range(n_images * rows * cols):

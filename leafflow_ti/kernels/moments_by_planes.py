@@ -32,12 +32,12 @@ def linear_kernel(spec: KernelSpec):
         to: ti.i32,
         plane: ti.i32,
         pitch: ti.i32,
-        first: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        offset: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        ring: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        weight: ti.types.ndarray(dtype=spec.real, ndim=1),
-        src: ti.types.ndarray(dtype=spec.real, ndim=1),
-        dst: ti.types.ndarray(dtype=spec.real, ndim=1),
+        first_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs + 1]
+        offset_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        ring_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        weight_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_terms]
+        src_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
+        dst_out: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
     ):
         for g in range(n_planes * rows * cols):
             line = g // cols
@@ -46,7 +46,7 @@ def linear_kernel(spec: KernelSpec):
             row = line - o * rows
             linear(
                 begin + o, at + row * at_row + x * col_step, 1, oldest + turn * row * row_step, slots, hop,
-                to + o * plane + row * pitch + x, first, offset, ring, weight, src, dst,
+                to + o * plane + row * pitch + x, first_in, offset_in, ring_in, weight_in, src_in, dst_out,
             )  # fmt: skip
 
     return linear_planes
@@ -66,19 +66,19 @@ def products_kernel(spec: KernelSpec):
         invalid: ti.i32,
         to: ti.i32,
         plane: ti.i32,
-        group: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        one: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        two: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        factor: ti.types.ndarray(dtype=spec.real, ndim=1),
-        constant: ti.types.ndarray(dtype=spec.real, ndim=1),
-        scratch: ti.types.ndarray(dtype=spec.real, ndim=1),
+        group_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_groups + 1]
+        one_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_pairs]
+        two_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_pairs]
+        factor_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_pairs, POWERS]
+        constant_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_groups]
+        scratch_tmp: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
     ):
         for h in range(n_groups * rows * pitch):
             g = h // (rows * pitch)
             pixel = h - g * (rows * pitch)
             products(
                 begin + g, pixel, pixel + invalid, to + g * POWERS * plane + pixel, plane,
-                group, one, two, factor, constant, scratch, scratch,
+                group_in, one_in, two_in, factor_in, constant_in, scratch_tmp, scratch_tmp,
             )  # fmt: skip
 
     return multiply_planes
@@ -99,12 +99,12 @@ def window_kernel(spec: KernelSpec):
         hop: ti.i32,
         taps: ti.i32,
         pitch: ti.i32,
-        first: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        offset: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        table: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        tap: ti.types.ndarray(dtype=spec.real, ndim=1),
-        src: ti.types.ndarray(dtype=spec.real, ndim=1),
-        dst: ti.types.ndarray(dtype=spec.real, ndim=1),
+        first_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs + 1]
+        offset_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        table_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_windows]
+        tap_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
+        src_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
+        dst_out: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
     ):
         for g in range(n_planes * rows * cols):
             line = g // cols
@@ -113,7 +113,7 @@ def window_kernel(spec: KernelSpec):
             row = line - o * rows
             window(
                 o, row * row_step + x * col_step, 1, hop, taps, (o * rows + row) * pitch + x, 1, 1,
-                first, offset, table, tap, src, dst,
+                first_in, offset_in, table_in, tap_in, src_in, dst_out,
             )  # fmt: skip
 
     return window_planes

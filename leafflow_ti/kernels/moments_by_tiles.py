@@ -94,24 +94,24 @@ def tile_kernel(spec: KernelSpec):
         maps_at: ti.i32,
         scratch_size: ti.i32,
         invalid: ti.i32,  # place of the count of invalid pixels
-        steps: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        first: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of linear passes, [n_outputs + 1]
-        column: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], of a row of scratch
-        n_blocks: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], times BLOCK columns
-        trim: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], rows that are not needed at both ends
-        offset: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
-        ring: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        weight: ti.types.ndarray(dtype=spec.real, ndim=1),
-        group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_groups + 1]
-        one: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_pairs]
-        two: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        factor: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_pairs, POWERS]
-        constant: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_groups]
         inner: ti.i32,  # first column of products in a row of scratch
         inner_blocks: ti.i32,
-        raw: ti.types.ndarray(dtype=V, ndim=1),
-        scratch: ti.types.ndarray(dtype=V, ndim=1),
-        maps: ti.types.ndarray(dtype=V, ndim=1),
+        steps_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_steps, Step.N]
+        first_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs + 1]
+        column_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], of a row of scratch
+        n_blocks_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], times BLOCK columns
+        trim_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs], rows that are not needed at both ends
+        offset_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        ring_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        weight_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_terms]
+        group_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_groups + 1]
+        one_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_pairs]
+        two_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_pairs]
+        factor_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_pairs, POWERS]
+        constant_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_groups]
+        raw_in: ti.types.ndarray(dtype=V, ndim=1),  # [frames, tiles, rows, images, columns]
+        scratch_tmp: ti.types.ndarray(dtype=V, ndim=1),  # [any]
+        maps_out: ti.types.ndarray(dtype=V, ndim=1),  # [frames, maps, segment, pitch]
     ):
         for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
             if part == 0:
@@ -122,13 +122,14 @@ def tile_kernel(spec: KernelSpec):
                     for i in range(tall):
                         for s in range(n_raw):
                             at = s * Step.N
-                            to = home + steps[at + Step.TARGET]
-                            to += (i % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
+                            to = home + steps_in[at + Step.TARGET]
+                            to += (i % steps_in[at + Step.TARGET_SLOTS]) * steps_in[at + Step.TARGET_HOP]
                             # Raw frames come from far away, in long stretches; scratch from a near cache, where a few
                             # columns of all sources stay in the nearest one while all outputs are made of them.
                             linear_step(
-                                at, i, tall - 1 - i, steps[at + Step.BLOCKS], (t * tall + i) * raw_row, oldest, to,
-                                steps, first, column, n_blocks, trim, offset, ring, weight, raw, scratch,
+                                at, i, tall - 1 - i, steps_in[at + Step.BLOCKS], (t * tall + i) * raw_row, oldest, to,
+                                steps_in, first_in, column_in, n_blocks_in, trim_in, offset_in, ring_in, weight_in,
+                                raw_in, scratch_tmp,
                             )  # fmt: skip
                         until = n_early
                         if i >= 2 * halo:
@@ -139,24 +140,26 @@ def tile_kernel(spec: KernelSpec):
                             row, early = i, i
                             if s >= n_early:
                                 row, early = i - 2 * halo, -1
-                            if steps[at + Step.PRODUCTS] == 1:
+                            if steps_in[at + Step.PRODUCTS] == 1:
                                 product_step(
-                                    at, home, inner, inner_blocks, invalid, steps,
-                                    group, one, two, factor, constant, scratch,
+                                    at, home, inner, inner_blocks, invalid, steps_in,
+                                    group_in, one_in, two_in, factor_in, constant_in, scratch_tmp,
                                 )  # fmt: skip
                             else:
-                                to = home + steps[at + Step.TARGET]
-                                to += (row % steps[at + Step.TARGET_SLOTS]) * steps[at + Step.TARGET_HOP]
+                                to = home + steps_in[at + Step.TARGET]
+                                to += (row % steps_in[at + Step.TARGET_SLOTS]) * steps_in[at + Step.TARGET_HOP]
                                 linear_step(
-                                    at, early, tall - 1 - i, 1, home, row % steps[at + Step.SLOTS], to,
-                                    steps, first, column, n_blocks, trim, offset, ring, weight, scratch, scratch,
+                                    at, early, tall - 1 - i, 1, home, row % steps_in[at + Step.SLOTS], to,
+                                    steps_in, first_in, column_in, n_blocks_in, trim_in, offset_in, ring_in, weight_in,
+                                    scratch_tmp, scratch_tmp,
                                 )  # fmt: skip
                         begin = i - 2 * halo - (length - 1)
                         if begin >= 0 and begin % block == 0:
-                            to = maps_at + t * map_tile + begin // block * steps[last + Step.TARGET_HOP]
+                            to = maps_at + t * map_tile + begin // block * steps_in[last + Step.TARGET_HOP]
                             linear_step(
-                                last, -1, 0, 1, home, begin % steps[last + Step.SLOTS], to,
-                                steps, first, column, n_blocks, trim, offset, ring, weight, scratch, maps,
+                                last, -1, 0, 1, home, begin % steps_in[last + Step.SLOTS], to,
+                                steps_in, first_in, column_in, n_blocks_in, trim_in, offset_in, ring_in, weight_in,
+                                scratch_tmp, maps_out,
                             )  # fmt: skip
 
     return filter_tiles
@@ -190,20 +193,20 @@ def across_kernel(spec: KernelSpec):
         slot_size: ti.i32,
         source_pitch: ti.i32,
         scratch_size: ti.i32,
-        sums: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        wides: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        first: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        offset: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        ring: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        weight: ti.types.ndarray(dtype=spec.real, ndim=1),
-        wide_first: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        wide_offset: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        table: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        tap: ti.types.ndarray(dtype=spec.real, ndim=1),
-        maps: ti.types.ndarray(dtype=V, ndim=1),
-        scratch: ti.types.ndarray(dtype=V, ndim=1),
-        numbers: ti.types.ndarray(dtype=spec.real, ndim=1),  # scratch once more
-        wide: ti.types.ndarray(dtype=spec.real, ndim=1),
+        sums_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_sets + 1]
+        wides_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_sets + 1]
+        first_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs + 1]
+        offset_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        ring_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        weight_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_terms]
+        wide_first_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_wides + 1]
+        wide_offset_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_windows]
+        table_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_windows]
+        tap_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
+        maps_in: ti.types.ndarray(dtype=V, ndim=1),  # [frames, maps, segment, pitch]
+        scratch_tmp: ti.types.ndarray(dtype=V, ndim=1),  # [any]
+        numbers_tmp: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any], scratch once more
+        wide_out: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_wides, strips, rows, lanes]
     ):
         for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
             if part == 0:
@@ -212,18 +215,18 @@ def across_kernel(spec: KernelSpec):
                 for item in range(task * n_items // n_tasks, (task + 1) * n_items // n_tasks):
                     j = item // n_sets
                     g = item - j * n_sets
-                    for s in range(sums[g], sums[g + 1]):
-                        to = task * scratch_size + (s - sums[g]) * source_pitch
+                    for s in range(sums_in[g], sums_in[g + 1]):
+                        to = task * scratch_size + (s - sums_in[g]) * source_pitch
                         for c in range(((cols - 1) * step + taps + BLOCK - 1) // BLOCK):
                             linear(
                                 s, j * pitch + BLOCK * c, 1, oldest, n_slots, slot_size, to + BLOCK * c,
-                                first, offset, ring, weight, maps, scratch,
+                                first_in, offset_in, ring_in, weight_in, maps_in, scratch_tmp,
                             )  # fmt: skip
-                    for w in range(wides[g], wides[g + 1]):
+                    for w in range(wides_in[g], wides_in[g + 1]):
                         for c in range((cols + BLOCK - 1) // BLOCK):
                             window(
                                 w, task * scratch_size + BLOCK * c * step, step, 1, taps, result + BLOCK * c, 1, BLOCK,
-                                wide_first, wide_offset, table, tap, scratch, scratch,
+                                wide_first_in, wide_offset_in, table_in, tap_in, scratch_tmp, scratch_tmp,
                             )  # fmt: skip
                         for strip in range(strips):
                             begin = (result + strip * lanes) * lanes
@@ -232,7 +235,7 @@ def across_kernel(spec: KernelSpec):
                                 if row < rows:
                                     to = ((w * strips + strip) * rows + row) * lanes
                                     for x in range(lanes):
-                                        wide[to + x] = numbers[begin + x * lanes + lane]
+                                        wide_out[to + x] = numbers_tmp[begin + x * lanes + lane]
 
     return across
 
@@ -253,12 +256,12 @@ def down_kernel(spec: KernelSpec):
         taps: ti.i32,
         strips: ti.i32,
         pitch: ti.i32,  # of the tensor, in vectors
-        first: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        offset: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        table: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        tap: ti.types.ndarray(dtype=spec.real, ndim=1),
-        wide: ti.types.ndarray(dtype=V, ndim=1),
-        tensor: ti.types.ndarray(dtype=V, ndim=1),
+        first_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_outputs + 1]
+        offset_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
+        table_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_windows]
+        tap_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
+        wide_in: ti.types.ndarray(dtype=V, ndim=1),  # [n_wides, strips, rows, lanes]
+        tensor_out: ti.types.ndarray(dtype=V, ndim=1),  # [n_planes, rows, pitch]
     ):
         for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
             if part == 0:
@@ -270,7 +273,7 @@ def down_kernel(spec: KernelSpec):
                         row = BLOCK * c
                         window(
                             o, strip * rows_in + row * step, step, 1, taps, (o * rows + row) * pitch + strip, pitch,
-                            rows - row, first, offset, table, tap, wide, tensor,
+                            rows - row, first_in, offset_in, table_in, tap_in, wide_in, tensor_out,
                         )  # fmt: skip
 
     return down

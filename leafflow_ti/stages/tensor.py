@@ -194,7 +194,7 @@ class TensorStage:
         tile_kernel(device.moments)(
             len(lowered.steps), lowered.n_raw, lowered.n_early, g.n_tiles, self._n_tiling, lowered.raw_row,
             g.map_rows, g.halo[0], self._pushed % self.n_taps, g.y.step, g.y.length, g.map_tile, maps_at,
-            lowered.scratch, lowered.invalid, *self._filter_tables, g.halo[1], -(-g.inner // UNROLLED), *arrays,
+            lowered.scratch, lowered.invalid, g.halo[1], -(-g.inner // UNROLLED), *self._filter_tables, *arrays,
         )  # fmt: skip
 
     def _make_tensor(self, number: int) -> None:
