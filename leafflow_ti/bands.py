@@ -42,16 +42,13 @@ class Demand:
         itemsize = 4 if config.precision == "f32" else 8
         # Two more rows and columns for the growth at the edges.
         band = Band.of(problem.sampling, rows + 2, self.cols + 2, config.window.stride)
-        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize)
+        own = problem.own_flows.requests if problem.own_flows else ()
+        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize, own)
         read = band
         if ranges and ranges.depth and ranges.layout:
             depth = ranges.depth
             read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
             total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize)
-        own = problem.own_flows
-        if own:
-            one = band_bytes(own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize)
-            total += len(own.steps) * one
         margin = 0
         if config.filters.prefilter != "none":
             margin = gaussian_radius(config.filters.sigma_pre)

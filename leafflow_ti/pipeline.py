@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from leafflow_ti.capture import Capture
 from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
-from leafflow_ti.models import TensorLayout
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import RangeEngine, Sample
 from leafflow_ti.reading import Box, Reader
@@ -33,31 +32,20 @@ _NO_IMAGES: NDArray[Any] = np.empty((0, 0, 0, 0), np.float32)
 
 @dataclass
 class _Engine:
-    """The stages for bands of one height: prefilter, tensor of the reference model, tensors of the own flows, estimate.
-
-    ``inner``: the cameras of a block under the filters and window of the reference model; ``own_cameras``: place of
-    each own flow's camera in a block.
-    """
+    """The stages for bands of one height: prefilter, tensors of the reference model and of the own flows, estimate."""
 
     prefilter: Prefilter | None
     tensor: TensorStage
-    own: list[TensorStage]
     estimate: EstimateStage
-    inner: tuple[slice, slice]
-    own_cameras: list[tuple[slice, slice]]
     ranges: RangeEngine | None = None
 
     def reset(self) -> None:
         """Forget all frames."""
-        for stage in (self.tensor, *self.own):
-            stage.reset()
+        self.tensor.reset()
 
-    def push(self, sample: Sample) -> tuple[Any, list[Any]] | None:
+    def push(self, sample: Sample) -> Any | None:
         """Add a frame of every camera; the tensors once the windows are full."""
-        block, valid = sample.block, sample.valid
-        tensor = self.tensor.push(block[self.inner], valid, sample.factors)
-        own = [stage.push(block[at], valid) for stage, at in zip(self.own, self.own_cameras, strict=True)]
-        return None if tensor is None else (tensor, own)
+        return self.tensor.push(sample.block, sample.valid, sample.factors)
 
 
 @dataclass(frozen=True)
@@ -126,10 +114,10 @@ class Pipeline:
 
         while (tensors := one_more()) is None:
             pass
-        engine.estimate(*tensors)
+        engine.estimate(tensors)
         if trace is not None:
             with active(trace):
-                engine.estimate(*one_more())
+                engine.estimate(one_more())
         self.device.synchronize()
 
     def run(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
@@ -143,7 +131,8 @@ class Pipeline:
 
     def _make_engine(self, band: Band) -> _Engine:
         plan, problem = self.plan, self.plan.problem
-        tensor = TensorStage(self.device, problem.columns, plan.layout, problem.sampling, band)
+        own = problem.own_flows.requests if problem.own_flows else ()
+        tensor = TensorStage(self.device, problem.columns, plan.layout, problem.sampling, band, own)
         view = self._view((0, 0), band, tensor.out_pitch)
         ranges = RangeEngine(self.device, plan.ranges, problem.sampling, view, band) if plan.ranges else None
         read = ranges.outer if ranges else band
@@ -151,21 +140,8 @@ class Pipeline:
         prefilter = None
         if filters.prefilter != "none":
             prefilter = Prefilter(self.device, filters.prefilter, filters.sigma_pre, read.in_rows, read.in_cols)
-        own = problem.own_flows
-        stages: list[TensorStage] = []
-        places: list[tuple[slice, slice]] = []
-        first = [cameras[0] - at for cameras, at in zip(plan.cameras, self.capture.reference, strict=True)]
-        if own:
-            layout = TensorLayout.of(own.columns)
-            stages = [TensorStage(self.device, own.columns, layout, own.sampling, band) for _ in own.steps]
-            for x, y in own.steps:
-                places.append((slice(y - first[0], y - first[0] + 1), slice(x - first[1], x - first[1] + 1)))
-        sy, sx = (slice(-f - axis.radius, -f + axis.radius + 1) for f, axis in zip(
-            first, (problem.sampling.sy, problem.sampling.sx), strict=True
-        ))  # fmt: skip
         estimate = EstimateStage(self.device, problem, plan.layout, view, bool(plan.margin))
-        inner = (slice(None), slice(None)) if ranges else (sy, sx)  # range flow's block is one stack of images
-        return _Engine(prefilter, tensor, stages, estimate, inner, places, ranges)
+        return _Engine(prefilter, tensor, estimate, ranges)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
         """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.
@@ -216,8 +192,8 @@ class Pipeline:
                     if tensors is None:
                         continue
                     self.device.synchronize()
-                    with span("fit"):
-                        maps, status = self._maps(engine.estimate(*tensors), waiting[0], stay.centre)
+                    with span("host"):
+                        maps, status = self._maps(engine.estimate(tensors), waiting[0], stay.centre)
                         result = self._frame_of(index, maps, status, stay.place)
                 yield plan.unit(first + t - latency - plan.frames[first], index), *result
 

@@ -131,7 +131,8 @@ class Plan:
         def axis(name: str) -> str:
             plan = sampling.axis(name)
             taps = f"{len(plan.filters.smooth)} taps" if plan.filters else "no filter"
-            return f"{name}: {taps}, window of {plan.size}"
+            blocks = f" in {len(plan.blocks.weights)} blocks of {plan.blocks.step}" if plan.blocks else ""
+            return f"{name}: {taps}, window of {plan.size}{blocks}"
 
         lines = [
             f"model       {self.model}: {MODELS[self.model].summary}, {problem.columns.n} columns, "
@@ -235,7 +236,7 @@ def _sampling(capture: Capture, config: RunConfig, cameras: str, time: bool) -> 
     w = config.window
     camera = ("cameras", config.filters.taps_camera, w.size_camera, w.sigma_camera, config.filters.taps)
     frames = ("frames", config.filters.taps_time, w.size_time, w.sigma_time, config.filters.taps)
-    pixel = AxisSampling.gaussian(filter_set(config.filters.taps), w.size, w.sigma)
+    pixel = AxisSampling.gaussian(filter_set(config.filters.taps), w.size, w.sigma, w.stride)
     return Sampling(
         pixel,
         pixel,
@@ -246,8 +247,10 @@ def _sampling(capture: Capture, config: RunConfig, cameras: str, time: bool) -> 
 
 
 def _static(config: RunConfig) -> RunConfig:
-    """The configuration for the depth of single frames: the motion's own choices do not concern it."""
-    return config.model_copy(update={"model": config.model.model_copy(update={"brightness_terms": "none"})})
+    """The configuration for the depth of single frames, of every pixel: the motion's own choices do not concern it."""
+    model = config.model.model_copy(update={"brightness_terms": "none"})
+    window = config.window.model_copy(update={"stride": 1})
+    return config.model_copy(update={"model": model, "window": window})
 
 
 def _problem(capture: Capture, config: RunConfig, name: str, motion: str | None) -> Problem:

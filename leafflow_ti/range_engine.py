@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.estimate import EstimateStage, View
 from leafflow_ti.stages.gradients import GradientStage
-from leafflow_ti.stages.tensor import Band, TensorStage, eroded
+from leafflow_ti.stages.tensor import Band, TensorStage
 from leafflow_ti.status import HAS_VALUE, Status
 
 Array = NDArray[Any]
@@ -33,6 +34,15 @@ class Sample:
     status: NDArray[np.uint8]
     factors: Array | None = None
     maps: dict[str, Array] = field(default_factory=dict)
+
+
+def eroded(valid: NDArray[np.bool_], ry: int, rx: int) -> NDArray[np.bool_]:
+    """Where all pixels within (ry, rx) are valid; without the outermost ry rows and rx columns."""
+    rows, cols = valid.shape[0] - 2 * ry, valid.shape[1] - 2 * rx
+    inside = np.ones((rows, cols), bool)
+    for dy, dx in product(range(2 * ry + 1), range(2 * rx + 1)):
+        inside &= valid[dy : dy + rows, dx : dx + cols]
+    return inside
 
 
 class RangeEngine:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 ARCHES = ("cuda", "metal", "vulkan", "cpu")
 PLANE_LANES = 64
 DENSE_LANES = {"f32": 16, "f64": 16}
+MOMENT_LANES = 16
 ALIGNMENT = 256
 """Bytes: whole vectors are loaded from aligned addresses."""
 _lock = threading.Lock()
@@ -60,6 +61,13 @@ class Device:
         from leafflow_ti.kernels.spec import KernelSpec
 
         return KernelSpec(self.storage, self.algebra, 1 if self.gpu else PLANE_LANES, self.gpu)
+
+    @cached_property
+    def moments(self) -> KernelSpec:
+        """What the kernels from frames to structure tensors are compiled for."""
+        from leafflow_ti.kernels.spec import KernelSpec
+
+        return KernelSpec(self.storage, self.algebra, 1 if self.gpu else MOMENT_LANES, self.gpu)
 
     @cached_property
     def dense(self) -> KernelSpec:

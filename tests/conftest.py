@@ -20,7 +20,7 @@ from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import EstimateStage, View
 from leafflow_ti.stages.problem import OwnFlows, Problem, unknowns_of
-from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, TensorStage
+from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, Request, TensorStage
 from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
 
 GRIDS = {"single": (1, 1), "line-x": (1, 7), "line-y": (7, 1), "square": (5, 5)}
@@ -166,7 +166,12 @@ class Bench:
 
     @cached_property
     def _tensor(self) -> tuple[TensorStage, Any]:
-        stage = TensorStage(self.device, self.columns, self.layout, self.sampling, self.band)
+        own: list[Request] = []
+        if self.model and MODELS[self.model].own_flows:
+            sampling, columns = self.own_columns
+            layout = TensorLayout.of(columns)
+            own = [Request(columns, layout, sampling, (y, x)) for x, y in self.steps]
+        stage = TensorStage(self.device, self.columns, self.layout, self.sampling, self.band, own)
         valid = np.ones((len(self.images), *self.images.shape[3:]), bool) if self.valid is None else self.valid
         found = [stage.push(block, ok) for block, ok in zip(self.images, valid, strict=True)]
         assert all(tensor is None for tensor in found[:-1])
@@ -184,16 +189,6 @@ class Bench:
         rows, cols = self.images.shape[1:3]
         steps = [(i - cols // 2, j - rows // 2) for j in range(rows) for i in range(cols)]
         return tuple(s for s in steps if s != (0, 0) or not MODELS[self.model].reference_rows)
-
-    @cached_property
-    def _own_tensors(self) -> list[Any]:
-        sampling, columns = self.own_columns
-        found = []
-        for x, y in self.steps:
-            stage = TensorStage(self.device, columns, TensorLayout.of(columns), sampling, self.band)
-            images = self.own_images(x, y)
-            found.append([stage.push(block, np.ones(block.shape[2:], bool)) for block in images][-1])
-        return found
 
     def own_images(self, x: int, y: int) -> np.ndarray:
         """Images [t, 1, 1, y, x] of the camera at a step from the reference."""
@@ -262,7 +257,7 @@ class Bench:
         """
         from leafflow_ti.kernels.workspace import Region
 
-        tensors: list[Any] = []
+        tensors = self._tensor[1]
         apart = bool(options.pop("apart", True))
         if motion is not None:
             model = MODELS[self.model]
@@ -275,9 +270,7 @@ class Bench:
                 growth = bool(options.pop("growth", "x" in own))
                 without = options.pop("without", ())
                 kept = [i for i in range(len(self.steps)) if i not in without]
-                tensors = [self._own_tensors[i] for i in kept]
-                for i in options.pop("lost", ()):
-                    tensors[i] = self.device.array(np.zeros_like(self.device.host(tensors[i])))
+                tensors = self._chosen(kept, options.pop("lost", ()))
                 options["own_flows"] = OwnFlows(
                     columns, sampling, tuple(self.steps[i] for i in kept), own, unknowns, model.reference_rows, growth
                 )
@@ -285,13 +278,23 @@ class Bench:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("leafflow_ti.stages.estimate.BATCH_BYTES", 64 << 20)  # one batch: its workspace is looked at
             stage = EstimateStage(self.device, problem, self.layout, self.view, apart=apart)
-        planes = np.array(stage(self._tensor[1], tensors))
+        planes = np.array(stage(tensors))
         k, flow = self.columns.n_time_like, self.columns.n_flow
         if not apart:
             return Estimated(problem, planes, np.empty(0), np.empty(0))
         parameters = self._region(stage, Region.PARAMETERS, k * flow)
         variance = self._region(stage, Region.VARIANCE, k)
         return Estimated(problem, planes, parameters.reshape(*parameters.shape[:2], k, flow), variance)
+
+    def _chosen(self, kept: Sequence[int], lost: Sequence[int]) -> Any:
+        """The grid's tensor and those of the ``kept`` own flows; of these, ``lost`` ones are all zero."""
+        stage, tensors = self._tensor
+        own = TensorLayout.of(self.own_columns[1])
+        sizes = [len(layout.entries) + EXTRA_PLANES for layout in (self.layout, *[own] * len(self.steps))]
+        starts = np.cumsum([0, *sizes]) * self.band.rows * stage.out_pitch
+        parts = np.split(np.array(self.device.host(tensors)), starts[1:-1])
+        own_parts = [parts[1 + i] * (n not in lost) for n, i in enumerate(kept)]
+        return self.device.array(np.concatenate([parts[0], *own_parts]))
 
     def _region(self, stage: EstimateStage, region: int, size: int) -> np.ndarray:
         """A region of the workspace, [rows, cols, size]."""

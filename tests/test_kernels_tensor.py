@@ -12,7 +12,8 @@ from tolerances import EXACT, tolerance
 
 from leafflow_ti.filters import FILTER_SETS, filter_set
 from leafflow_ti.models import AXES, MODELS, column_set, monomial
-from leafflow_ti.sampling import AxisSampling, Sampling
+from leafflow_ti.sampling import LEAST_BLOCKS, AxisSampling, Sampling
+from leafflow_ti.stages.tensor import Band
 
 PIXELS = ((0, 0), (1, 3), (2, 4))
 PASSES = ("t", "sy", "sx", "y", "x")
@@ -50,6 +51,44 @@ def test_any_stride_and_width(bench: Callable, stride: int, cols: int) -> None:
         J, rho = b.reference(*pixel)
         assert relative_error(b.tensor(*pixel), J) <= tolerance(b.device).tensor
         assert b.planes[-2, *pixel] / b.planes[-3, *pixel] == pytest.approx(rho, rel=tolerance(b.device).tensor)
+
+
+@pytest.mark.parametrize("model", ["affine-4d", "flow-quadratic"])
+@pytest.mark.parametrize(("size", "stride"), [(19, 2), (31, 3), (37, 4), (29, 3), (19, 4)])
+def test_windows_of_blocks_equal_direct_sums(
+    make_bench: Callable, model: str, size: int, stride: int, precision: str
+) -> None:
+    """Blocks of odd and even length, odd and even in number, and several to an output: the sums are exact."""
+    pixel = AxisSampling.gaussian(filter_set("5"), size, 0.3 * size, stride)
+    assert pixel.blocks is not None
+    along = {"sx": SERIES} if model == "affine-4d" else {}
+    sampling = Sampling(pixel, pixel, t=SERIES, **along)
+    columns = column_set(MODELS[model], "camera", sampling.camera_axes, sampling.sampled)
+    band = Band.of(sampling, 20, 3, stride)
+    cameras = 2 * sampling.sx.radius + 1
+    images = np.random.default_rng(7).random((2 * SERIES.radius + 1, 1, cameras, band.in_rows, band.in_cols))
+    b = make_bench(images, sampling, columns, precision, (band.rows, band.cols), stride)
+    for pixel_at in ((0, 0), (19, 2), (11, 1)):
+        J, rho = b.reference(*pixel_at)
+        assert relative_error(b.tensor(*pixel_at), J) <= tolerance(b.device).tensor
+        assert b.planes[-2, *pixel_at] / b.planes[-3, *pixel_at] == pytest.approx(rho, rel=tolerance(b.device).tensor)
+
+
+@pytest.mark.parametrize("size", [19, 31, 65])
+@pytest.mark.parametrize("stride", range(1, 9))
+def test_blocks_keep_length_and_second_moment(size: int, stride: int) -> None:
+    smooth = AxisSampling.gaussian(None, size, 0.29 * size)
+    found = AxisSampling.gaussian(None, size, 0.29 * size, stride)
+    if found.blocks is None:
+        assert found == smooth
+        assert all(stride % d or (size - 1) // d < LEAST_BLOCKS for d in range(2, stride + 1))
+        return
+    assert stride % found.blocks.step == 0
+    assert found.size % 2 == 1
+    assert abs(found.size - size) <= (found.blocks.step + 1) / 2
+    assert found.weights == pytest.approx(found.weights[::-1], rel=1e-12)
+    assert found.moment(0) == pytest.approx(1.0, rel=1e-12)
+    assert found.moment(2) == pytest.approx(smooth.moment(2), rel=1e-9)
 
 
 @pytest.mark.parametrize("taps", FILTER_SETS)

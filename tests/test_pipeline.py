@@ -22,10 +22,9 @@ from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import RunConfig, load_config
 from leafflow_ti.errors import InputError
 from leafflow_ti.models import MODELS
-from leafflow_ti.plan import Plan
+from leafflow_ti.plan import Plan, make_plan
 from leafflow_ti.progress import Progress, Timings
 from leafflow_ti.runtime import start
-from leafflow_ti.stages.tensor import OUTPUT_PLANES
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import PlaneScene, render, truth
 from leafflow_ti.synthetic.write import write_scene
@@ -88,6 +87,14 @@ def assert_same(one: lf.Field, two: lf.Field, part: tuple[slice, slice] = (slice
 def test_tiled_equals_whole(capture: Capture, tile: int, precision: str) -> None:
     whole = lf.estimate(capture, 6, **OPTIONS, tile=43, precision=precision)
     assert_same(whole, lf.estimate(capture, 6, **OPTIONS, tile=tile, precision=precision))
+
+
+@pytest.mark.parametrize("stride", [2, 4])
+def test_tiled_equals_whole_with_windows_of_blocks(capture: Capture, stride: int) -> None:
+    options = {**OPTIONS, "window": 19, "sigma": 5.0, "stride": stride}
+    assert "in 9 blocks of 2" in make_plan(capture, config(**options)).describe()
+    whole, tiled = (lf.estimate(capture, 6, **options, tile=tile) for tile in (22, 3))
+    assert_same(whole, tiled)
 
 
 def test_tiled_equals_whole_with_stride_and_mask(capture: Capture, tmp_path: Path) -> None:
@@ -280,9 +287,11 @@ def test_stated_disparity_offset_is_part_of_the_depth() -> None:
 
 def test_plan_counts_every_output_plane() -> None:
     # The plan is made without the engine, so it cannot ask the kernels.
-    from leafflow_ti.kernels.maps import Output
+    from leafflow_ti.kernels import maps, spec
+    from leafflow_ti.stages import tensor
 
-    assert Output.PLANES == OUTPUT_PLANES
+    assert maps.Output.PLANES == tensor.OUTPUT_PLANES
+    assert spec.EXTRA_PLANES == tensor.EXTRA_PLANES
 
 
 def test_the_engine_is_left_as_it_was() -> None:

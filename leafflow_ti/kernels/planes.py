@@ -1,8 +1,7 @@
-"""Planes of images: correlations, and sums of products.
+"""Correlations of whole planes of images.
 
 A plane is ``[rows, pitch]``, ``pitch`` a multiple of the lanes; a stack of planes is one flat array. Which planes,
-shifts and weights make up which output is data (tables of terms), not code: the same two kernels filter along every
-axis, sum over cameras and frames, and convolve with every moment window, for every model.
+shifts and weights make up which output is data (tables of terms), not code.
 """
 
 import functools
@@ -72,70 +71,6 @@ def filter_planes_kernel(spec: KernelSpec, col_step: int):
                         one_group(g, rows, pitch, row_step, to, first_in, offset_in, weight_in, src_in, dst_out)
 
     return filter_planes
-
-
-@functools.cache
-def sum_products_kernel(spec: KernelSpec):
-    """``dst[o] = mask Σ_k weight[k] src[a[k]] src[b[k]]``, pixel by pixel, k from first[o] to first[o + 1].
-
-    ``a`` and ``b`` are planes of ``src``, all planes having the same rows and pitch.
-    """
-    real, lanes = spec.real, spec.lanes
-
-    @ti.func
-    def one_group(
-        g: ti.i32,
-        n_planes: ti.i32,
-        size: ti.i32,
-        to: ti.i32,
-        first: ti.template(),
-        a: ti.template(),
-        b: ti.template(),
-        weight: ti.template(),
-        mask: ti.template(),
-        src: ti.template(),
-        dst: ti.template(),
-    ):
-        at = g * lanes
-        for plane in range(n_planes):
-            total = ti.Vector.zero(real, lanes)
-            for k in range(first[plane], first[plane + 1]):
-                one = a[k] * size + at
-                two = b[k] * size + at
-                w = weight[k]
-                for i in range(lanes):
-                    total[i] += w * (src[one + i] * src[two + i])
-            for i in range(lanes):
-                total[i] *= mask[at + i]
-            place = to + plane * size + at
-            for i in range(lanes):
-                dst[place + i] = total[i]
-
-    @ti.kernel
-    def sum_products(
-        n_planes: ti.i32,
-        size: ti.i32,
-        to: ti.i32,
-        n_tasks: ti.i32,
-        first_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_planes + 1]
-        a_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
-        b_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_terms]
-        weight_in: ti.types.ndarray(dtype=real, ndim=1),  # [n_terms]
-        mask_in: ti.types.ndarray(dtype=real, ndim=1),  # [size]
-        src_in: ti.types.ndarray(dtype=real, ndim=1),  # [n_src * size]
-        dst_out: ti.types.ndarray(dtype=real, ndim=1),  # [to + n_planes * size]
-    ):
-        n_groups = size // lanes
-        if ti.static(spec.gpu):
-            for g in range(n_groups):
-                one_group(g, n_planes, size, to, first_in, a_in, b_in, weight_in, mask_in, src_in, dst_out)
-        else:
-            for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
-                if part == 0:
-                    for g in range(task * n_groups // n_tasks, (task + 1) * n_groups // n_tasks):
-                        one_group(g, n_planes, size, to, first_in, a_in, b_in, weight_in, mask_in, src_in, dst_out)
-
-    return sum_products
 
 
 @functools.cache

@@ -414,13 +414,12 @@ class EstimateStage:
             first = end
         return runs
 
-    def __call__(self, tensor: Any, own_tensors: Sequence[Any] = ()) -> NDArray[Any]:
-        """The planes of ``Output`` as a NumPy array [planes, rows, cols]."""
+    def __call__(self, tensors: Any) -> NDArray[Any]:
+        """The planes of ``Output`` as a NumPy array [planes, rows, cols]; ``tensors``: what ``TensorStage`` returns."""
         from leafflow_ti.kernels.maps import Output
 
         device, view, lanes = self.device, self.view, self.device.dense.lanes
         n_pixels = view.rows * view.pitch
-        tensors = self._together([tensor, *own_tensors], n_pixels)
         workspace = device.vectors(self._workspace, lanes)
         task_step, group_step = (0, self.layout.n_elements) if self.apart else (self.layout.n_elements, 0)
         n_groups = view.rows * self._row_groups
@@ -435,12 +434,3 @@ class EstimateStage:
         planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)
         result: NDArray[Any] = planes[:, :, : view.cols]
         return result
-
-    def _together(self, tensors: Sequence[Any], n_pixels: int) -> Any:
-        """All tensors in one array, where the tables' FIRST_PLANE says."""
-        if len(tensors) == 1:
-            return tensors[0]
-        planes = np.diff(self._first_plane)
-        return self.device.array(
-            np.concatenate([self.device.host(t)[: n * n_pixels] for t, n in zip(tensors, planes, strict=True)])
-        )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from leafflow_ti.models import ColumnSet
+from leafflow_ti.models import ColumnSet, TensorLayout
 from leafflow_ti.sampling import Sampling
+from leafflow_ti.stages.channels import Request
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,12 @@ class OwnFlows:
     unknowns: int
     reference_rows: bool
     growth: bool = False
+
+    @property
+    def requests(self) -> tuple[Request, ...]:
+        """What the tensor stage is asked for: one tensor of each camera."""
+        layout = TensorLayout.of(self.columns)
+        return tuple(Request(self.columns, layout, self.sampling, (y, x)) for x, y in self.steps)
 
 
 @dataclass(frozen=True)
