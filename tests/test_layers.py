@@ -20,10 +20,10 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("kernels",), 2),
     **dict.fromkeys(("capture", "models", "config", "geometry", "field", "filters", "sampling", "range_flow"), 3),
     **dict.fromkeys(("synthetic", "metrics"), 3),
-    **dict.fromkeys(("runtime",), 4),
+    **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
     **dict.fromkeys(("growth",), 5),
-    **dict.fromkeys(("plan", "pipeline", "range_plan", "range_source", "range_engine", "results"), 6),
+    **dict.fromkeys(("plan", "pipeline", "range_plan", "range_source", "range_engine", "results", "work"), 6),
     **dict.fromkeys(("quicklook", "api"), 7),
     **dict.fromkeys(("cli",), 8),
 }

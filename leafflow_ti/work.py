@@ -1,0 +1,296 @@
+"""How much each stage must compute and move: flops and bytes per output pixel, counted from the tables of a plan.
+
+What is counted is the least that the chosen algorithm needs: a multiply-add is two flops, taps that are zero cost
+nothing, square roots and divisions count as one, and bytes are those of arrays too large for a cache, each read or
+written once. Halos, padding, masks, prefilters and conversions of grey values are the implementation's business: they
+lower the share of the machine's ceilings that a stage reaches. Times are of one more frame of a sequence.
+
+Stages: ``filter`` (derivatives, products and their sums over cameras, per new frame), ``tensor`` (sums over frames,
+moment windows), ``solve`` (null space, covariances of the flow parameters), ``fit`` (geometry, motion, maps).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from leafflow_ti.models import AXES, ColumnSet, TensorLayout
+from leafflow_ti.plan import Plan
+from leafflow_ti.sampling import AxisSampling, Sampling, cross_noise
+from leafflow_ti.stages.problem import Problem
+
+Key = tuple[Any, ...]
+STAGES = ("filter", "tensor", "solve", "fit")
+EXTRA = 4
+"""Maps beside those of the tensor: window mass, energies of the gradient, of it smoothed once more, of the image."""
+EXTRA_FLOPS = 12
+"""Their products: squares of two gradients, of the two smoothed, of the grey value, times the mask."""
+BLOCK = 4
+"""Vectors of the block inverse iteration."""
+RITZ_SWEEPS, FULL_SWEEPS = 3, 8
+"""Sweeps after which cyclic Jacobi has usually converged: of BLOCK x BLOCK and of N x N matrices."""
+ROW_FLOPS = 40
+"""Coefficients of one row of the motion fit."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """``flops`` and ``bytes`` per output pixel."""
+
+    flops: float = 0.0
+    bytes: float = 0.0
+
+    def __add__(self, other: Work) -> Work:
+        return Work(self.flops + other.flops, self.bytes + other.bytes)
+
+    def __mul__(self, factor: float) -> Work:
+        return Work(self.flops * factor, self.bytes * factor)
+
+
+@dataclass(frozen=True)
+class _Data:
+    """One data vector: its columns on their sampling."""
+
+    columns: ColumnSet
+    layout: TensorLayout
+    sampling: Sampling
+
+    @property
+    def samples(self) -> int:
+        """Camera samples of the window."""
+        return self.sampling.sx.size * self.sampling.sy.size
+
+    @property
+    def maps(self) -> set[Key]:
+        """Product images summed over cameras: channels, powers of the camera offsets."""
+        return {(m.channels, _power(m.exponents, "sy"), _power(m.exponents, "sx")) for m in self.layout.moments}
+
+
+def _power(exponents: tuple[int, ...], axis: str) -> int:
+    return exponents[AXES.index(axis)]
+
+
+def count_work(plan: Plan, block: int = 1) -> dict[str, Work]:
+    """Work of each of ``STAGES`` per output pixel of one more frame.
+
+    ``block``: side [px] of the blocks over which the windows are constant; 1 for windows that are not.
+    """
+    problem, stride = plan.problem, plan.config.window.stride
+    total = _count(problem, plan.layout, plan.config.precision, stride, block, len(plan.names), bool(plan.margin))
+    if plan.ranges and plan.ranges.depth and plan.ranges.layout:
+        # Range flow measures the depth of every input pixel first.
+        depth = _count(plan.ranges.depth, plan.ranges.layout, plan.config.precision, 1, 1, 4, False)
+        total = {stage: total[stage] + depth[stage] * stride**2 for stage in STAGES}
+    return total
+
+
+def _count(
+    problem: Problem, layout: TensorLayout, precision: str, stride: int, block: int, n_maps: int, differences: bool
+) -> dict[str, Work]:
+    itemsize = 4 if precision == "f32" else 8
+    own = problem.own_flows
+    vectors = [_Data(problem.columns, layout, problem.sampling)]
+    if own:
+        vectors += len(own.steps) * [_Data(own.columns, TensorLayout.of(own.columns), own.sampling)]
+    filters = _filter_flops(problem) + sum(_product_flops(data, block) for data in vectors)
+    kept = sum(_kept(data, block) for data in vectors)
+    images = _images(problem.columns, problem.sampling, len(own.steps) + 1 if own else 0)
+    entries = sum(len(data.layout.entries) + EXTRA for data in vectors)
+    n_t = problem.sampling.t.size
+    return {
+        "filter": Work(filters, itemsize * (images + kept)) * stride**2,
+        "tensor": Work(
+            sum(_window_flops(data, stride, block) for data in vectors),
+            itemsize * (n_t * kept * stride**2 + entries),
+        ),
+        "solve": Work(sum(_solve_flops(problem, data.columns) for data in vectors), itemsize * entries),
+        "fit": Work(_fit_flops(problem, differences), itemsize * (n_maps + 1)),
+    }
+
+
+def _images(columns: ColumnSet, sampling: Sampling, own_cameras: int) -> int:
+    """Grey images of one frame that are read."""
+    if columns.derived:
+        return 1 + max(d.image for d in columns.derived.values())
+    return max((2 * sampling.sy.radius + 1) * (2 * sampling.sx.radius + 1), own_cameras)
+
+
+def _taps(axis: AxisSampling, differentiate: bool) -> int:
+    return int(np.count_nonzero(axis.kernel(differentiate)))
+
+
+def _filter_flops(problem: Problem) -> int:
+    """Separable filters per pixel of the frame, plane by plane; and the gradient smoothed once more.
+
+    The axes come in the order that makes fewest planes: cameras before x and y; but after them where every camera's own
+    flow needs the derivatives along x, y and t anyway. A plane that is not differentiated yet goes on as it is and
+    with the axis's derivative, as far as one is wanted.
+    """
+    columns, sampling, own = problem.columns, problem.sampling, problem.own_flows
+    order = ("t", "y", "x", "sy", "sx") if own else ("t", "sy", "sx", "y", "x")
+    axes = {columns.derived[c].axis if columns.derived else c for c in columns.channels}
+    wanted: set[str | None] = {None if a == "i" else a for a in axes if a != "1"}
+    extent = {a: 2 * sampling.axis(a).radius + 1 for a in ("sy", "sx")}
+    cameras = _images(columns, sampling, len(own.steps) + 1 if own else 0)
+    aside = cameras - extent["sy"] * extent["sx"] if own else 0  # cameras that only their own flow needs
+    planes: set[str | None] = {None}
+    taps = 0
+    for i, name in enumerate(order):
+        axis = sampling.axis(name)
+        if axis.filters is None:
+            continue
+        if name in extent:
+            extent[name] -= 2 * axis.filter_radius
+            aside = 0
+        n_images = cameras if columns.derived else extent["sy"] * extent["sx"] + aside
+        later = wanted & {None, *order[i + 1 :]}
+        smooth = {d for d in planes if d is not None or later}
+        derived = {name} & wanted if None in planes else set()
+        taps += n_images * (len(smooth) * _taps(axis, False) + len(derived) * _taps(axis, True))
+        planes = smooth | derived
+    again = 2 * (_taps(sampling.x, False) + _taps(sampling.y, False))
+    return 2 * (taps + again)
+
+
+def _product_flops(data: _Data, block: int) -> float:
+    """Products of channels and their weighted sums over cameras per pixel of the frame; sums over blocks."""
+    pairs = {m.channels for m in data.layout.moments}
+    terms = sum(
+        int(np.count_nonzero(np.outer(data.sampling.sy.window(sy), data.sampling.sx.window(sx))))
+        for _, sy, sx in data.maps
+    )
+    flops = data.samples * len(pairs) + 2.0 * terms + EXTRA_FLOPS
+    if block > 1:
+        along_x, both = _block_moments(data)
+        flops += 2 * (len(along_x) + len(both) / block)
+    return flops
+
+
+def _block_moments(data: _Data) -> tuple[set[Key], set[Key]]:
+    """Sums over a block: of which maps times powers of x, and of x and y; all powers up to those of the moments."""
+    along_x: set[Key] = set()
+    both: set[Key] = set()
+    for m in data.layout.moments:
+        one = (m.channels, _power(m.exponents, "sy"), _power(m.exponents, "sx"))
+        for px, py in product(range(_power(m.exponents, "x") + 1), range(_power(m.exponents, "y") + 1)):
+            along_x.add((*one, px))
+            both.add((*one, px, py))
+    extra = {(n, 0) for n in range(EXTRA)}
+    return along_x | extra, both | extra
+
+
+def _kept(data: _Data, block: int) -> float:
+    """Numbers per pixel of the frame that are kept of it until it leaves the window."""
+    return len(data.maps) + EXTRA if block == 1 else len(_block_moments(data)[1]) / block**2
+
+
+def _window_flops(data: _Data, stride: int, block: int) -> float:
+    """Sums over the frames of the window, then windows along y and x, per output pixel.
+
+    From sums over blocks, the moment of power n is that of the blocks' own moments 0..n.
+    """
+    sampling = data.sampling
+    cells = stride / block  # per output pixel, along each axis
+    summed: set[Key] = set()
+    tall: dict[Key, int] = {}
+    wide = 0
+    for m in data.layout.moments:
+        n, power = _power(m.exponents, "y"), _power(m.exponents, "x")
+        one = (m.channels, *(_power(m.exponents, a) for a in ("sy", "sx", "t")))
+        parts = range(power + 1 if block > 1 else 1)
+        for px in parts:
+            summed |= {(*one, px, py) for py in range(n + 1 if block > 1 else 1)}
+            tall[(*one, px, n)] = n + 1 if block > 1 else 1
+        wide += len(parts)
+    size_x, size_y = (-(-sampling.axis(a).size // block) for a in "xy")
+    over_time = sum(int(np.count_nonzero(sampling.t.window(key[3]))) for key in summed)
+    over_time += EXTRA * sampling.t.size
+    flops = 2.0 * over_time * cells**2
+    flops += 2.0 * (sum(tall.values()) + EXTRA) * size_y * cells
+    return flops + 2.0 * (wide + EXTRA) * size_x
+
+
+def _cholesky(n: int) -> float:
+    return n * (n * n - 1) / 3 + n * (n - 1) / 2 + 2 * n
+
+
+def _substitute(n: int, columns: int) -> float:
+    """Both triangular solves."""
+    return 2.0 * n * n * columns
+
+
+def _jacobi(n: int, sweeps: int) -> float:
+    """Each rotation of rows, columns and vectors: 3 n pairs of 6 flops, and some 15 for the angle."""
+    return sweeps * n * (n - 1) / 2 * (18 * n + 15)
+
+
+def _solve_flops(problem: Problem, columns: ColumnSet) -> float:
+    """Null space, parameters, residuals and covariances of one data vector."""
+    n, flow, k = columns.n, columns.n_flow, columns.n_time_like
+    flops = n * (n + 1) + _cholesky(n) + flow * flow * k  # scaling, factor, least-squares start
+    if problem.estimator != "ols" and problem.solver == "fast":
+        orthogonalise = BLOCK * (BLOCK - 1) / 2 * 4 * n + BLOCK * 3 * n
+        flops += problem.iterations * (_substitute(n, BLOCK) + orthogonalise)
+        flops += n * n * BLOCK + BLOCK * (BLOCK + 1) * n + _jacobi(BLOCK, RITZ_SWEEPS) + 4 * n * BLOCK * BLOCK
+        flops += k * (n * n + 4 * n)  # residual against the gap
+    elif problem.estimator != "ols":
+        flops += _jacobi(n, FULL_SWEEPS)
+    flops += 2 * flow * k * k + k * (n * n + 3 * n)
+    flops += flow * (flow + 1) + _cholesky(flow)  # J_ff without its noise
+    for rows in _rows(problem, columns):
+        flops += flow * (flow + 1) / 2 + _substitute(flow, rows) + 2 * flow * flow * rows + rows * (rows + 1) * flow
+    return flops
+
+
+def _rows(problem: Problem, columns: ColumnSet) -> Iterable[int]:
+    """Rows of each solution whose covariances are wanted."""
+    own = problem.own_flows
+    brightness = columns.index("i") is not None
+    for axis in columns.solutions:
+        if axis != "t":
+            yield 2 * len(problem.terms) + brightness
+        elif own and columns is own.columns:
+            yield 2 * len(own.offsets)
+        else:
+            yield 2 * len(problem.offsets) + len(problem.brightness)
+
+
+def _fit_flops(problem: Problem, differences: bool) -> float:
+    """Geometry from every camera solution, the motion from its rows, pass by pass, and the errors of both."""
+    columns, sampling, own = problem.columns, problem.sampling, problem.own_flows
+    terms, flops = len(problem.terms), 0.0
+    motion_rows = 2 * len(problem.offsets)
+    for axis in problem.camera_axes:
+        rows = 2 * terms
+        flops += _cholesky(rows) + _substitute(rows, terms) + rows * terms * 2
+        if "t" in columns.solutions:
+            flops += rows * motion_rows * (5 * len(cross_noise(sampling, columns, axis, "t")) + 2 * terms)
+    if terms:
+        flops += _cholesky(terms) + _substitute(terms, 1 + motion_rows + terms)
+    variants = 3 if differences else 1
+    for i in range(problem.passes if problem.fitted else 0):
+        last = i == problem.passes - 1 and not own
+        flops += _row_set_flops(motion_rows + problem.use_range, terms, problem.fitted, variants if last else 1, True)
+    if own:
+        unknowns = own.unknowns + own.growth
+        sets = [2 * len(own.offsets)] * len(own.steps)
+        sets += [motion_rows + problem.use_range] if own.reference_rows else []
+        flops += sum(_row_set_flops(rows, terms, unknowns, variants, i == 0) for i, rows in enumerate(sets))
+    return flops
+
+
+def _row_set_flops(rows: int, terms: int, unknowns: int, variants: int, finish: bool) -> float:
+    """Design and its sensitivity to the geometry, weights, normal equations and covariances of one set of rows."""
+    flops = rows * (ROW_FLOPS + 2 * unknowns) * (1.0 + 2 * min(terms, 3))
+    flops += rows * terms * 2 * (terms + (rows + 1) / 2)  # D C_g D^T
+    flops += _cholesky(rows) + _substitute(rows, unknowns)
+    flops += 2 * rows * unknowns * (unknowns + 1)
+    flops += variants * 2 * rows * unknowns * (rows + unknowns + 2 * terms)
+    if finish:
+        flops += _cholesky(unknowns) + _substitute(unknowns, 1)
+        flops += variants * (2 * _substitute(unknowns, unknowns) + 2 * unknowns * terms * (terms + 2 * unknowns))
+    return flops

@@ -1,0 +1,86 @@
+"""Counted work against counts by hand, and the measured ceilings as numbers that can be ceilings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from leafflow_ti.capture import Capture, Geometry, capture_from_array
+from leafflow_ti.ceilings import measure_ceilings
+from leafflow_ti.config import load_config
+from leafflow_ti.plan import Plan, make_plan
+from leafflow_ti.runtime import Device
+from leafflow_ti.work import STAGES, count_work
+
+
+def capture(n_cameras: int) -> Capture:
+    images = np.random.default_rng(0).random((9, 1, n_cameras, 64, 96), np.float32)
+    return capture_from_array(images, Geometry(1000.0, (47.5, 31.5), (1.0, 0.0)))
+
+
+def plan(n_cameras: int = 9, **options: Any) -> Plan:
+    return make_plan(capture(n_cameras), load_config(overrides={"window": 33, "preshift": (0, 0), **options}))
+
+
+def test_optical_flow_is_counted_as_by_hand() -> None:
+    found = count_work(plan(1, model="flow"))
+    # Taps of 5-tap filters: 5 of a smoothing, 4 of a derivative. Along t: I, It; along y: I, Iy, It; along x: all three.
+    filters = 2 * ((5 + 4) + (5 + 4 + 5) + (4 + 5 + 5)) + 2 * 2 * (5 + 5)
+    products = 6 + 2 * 6 + (2 + 2 + 1 + 1) * 2  # each once, weighted into its map; and the four extra maps
+    assert found["filter"].flops == filters + products
+    planes = 6 + 4
+    assert found["tensor"].flops == 2 * planes * (5 + 33 + 33)
+    assert found["tensor"].bytes == 4 * (5 * planes + planes)
+    assert found["fit"].flops == 0
+
+
+def test_windows_of_the_4d_model_are_those_of_its_moments() -> None:
+    layout = plan(model="affine-4d", brightness="camera").layout
+    found = count_work(plan(model="affine-4d", brightness="camera"))
+    tall = {(m.channels, m.exponents[1:]) for m in layout.moments}
+    windows = 2 * 33 * (len(tall) + len(layout.moments) + 8)
+    summed = {(m.channels, m.exponents[2:]) for m in layout.moments}
+    assert windows < found["tensor"].flops <= windows + 2 * 5 * (len(summed) + 4)
+
+
+def test_a_stride_filters_every_pixel_and_solves_few() -> None:
+    one, four = (count_work(plan(model="affine-4d", stride=stride)) for stride in (1, 4))
+    assert four["filter"].flops == 16 * one["filter"].flops
+    assert four["solve"] == one["solve"]
+    assert one["tensor"].flops < four["tensor"].flops < 16 * one["tensor"].flops
+
+
+def test_windows_of_blocks_cost_less() -> None:
+    smooth, blocks = (count_work(plan(model="affine-4d", stride=4), block) for block in (1, 4))
+    assert blocks["tensor"].flops < smooth["tensor"].flops / 4
+    assert smooth["filter"].flops < blocks["filter"].flops < 1.3 * smooth["filter"].flops
+
+
+@pytest.mark.parametrize("estimator", ["ols", "tls", "tls-equilibrated"])
+@pytest.mark.parametrize("model", ["affine", "affine-4d", "scene-flow", "affine-scene-flow", "range-flow", "depth"])
+def test_every_model_has_work_in_every_stage(model: str, estimator: str) -> None:
+    found = count_work(plan(model=model, estimator=estimator, window=15))
+    assert tuple(found) == STAGES
+    for stage, work in found.items():
+        assert work.bytes > 0, stage
+        assert math.isfinite(work.flops), stage
+        assert work.flops > 0 or (stage == "fit" and model == "range-flow"), stage
+
+
+def test_full_jacobi_is_counted_as_the_dearer_solver() -> None:
+    fast, full = (count_work(plan(model="affine-4d", solver=solver)) for solver in ("fast", "jacobi"))
+    assert full["solve"].flops > 3 * fast["solve"].flops
+
+
+def test_ceilings_are_rates(device: Callable[[str], Device]) -> None:
+    single = device("f32")
+    found = measure_ceilings(single)
+    assert found.gflops_f32 > 0
+    assert math.isnan(found.gflops_f64) == (single.algebra == "f32")
+    assert found.gbytes > 0
+    assert math.isnan(found.gbytes_cache) == single.gpu
+    assert found.gflops("f32") == found.gflops_f32
