@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from leafflow_ti.ceilings import Ceilings
 from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.plan import Plan
 from leafflow_ti.sampling import AxisSampling, Sampling, cross_noise
@@ -49,6 +50,31 @@ class Work:
 
     def __mul__(self, factor: float) -> Work:
         return Work(self.flops * factor, self.bytes * factor)
+
+
+@dataclass(frozen=True)
+class Rate:
+    """What a stage reached: 10^9 flops and bytes per second, and their shares of the ceilings (0..1)."""
+
+    gflops: float
+    gbytes: float
+    compute: float
+    memory: float
+
+    @property
+    def limit(self) -> str:
+        """The ceiling that is nearer: with a small share of it, instructions or the cache are what holds the stage."""
+        return "compute" if self.compute >= self.memory else "memory"
+
+
+def rate(stage: str, work: Work, seconds: float, ceilings: Ceilings, storage: str, algebra: str) -> Rate:
+    """What one of ``STAGES`` reached that did ``work`` in ``seconds``; small matrices are in the ``algebra`` precision.
+
+    ``storage``, ``algebra``: "f32" or "f64", as of a ``Device``.
+    """
+    gflops, gbytes = work.flops / seconds / 1e9, work.bytes / seconds / 1e9
+    peak = ceilings.gflops(algebra if stage in ("solve", "fit") else storage)
+    return Rate(gflops, gbytes, gflops / peak, gbytes / ceilings.gbytes)
 
 
 @dataclass(frozen=True)
