@@ -51,7 +51,10 @@ CASES = (
     Case("yosemite", "yosemite:run", "affine optical flow of the Yosemite sequence against its truth"),
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
     Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),
-    Case("stages", "stages:run", "microseconds per output pixel and stage, beside SciPy/NumPy; peak memory"),
+    Case("stages", "stages:run", "microseconds per output pixel and stage, share of the machine's ceilings; memory"),
+    Case(
+        "compare", "compare:run", "beside NumPy/SciPy, numba, PyTorch, structure-tensor, scikit-image: times, agreement"
+    ),
 )
 
 
