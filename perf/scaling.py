@@ -97,10 +97,10 @@ def _panels(settings: Settings, device: Device) -> list[Panel]:
         seconds = {stage: getattr(found, stage) for stage in ("a", "b", "c", "sequence")}
         return seconds, len(plan.y) * len(plan.x), plan.problem.columns.n
 
-    size = Panel("image size", "output pixels", "output pixel")
+    size = Panel("image size", "side of the output [px]", "output pixel")
     for side in settings.sizes:
         seconds, pixels, _ = timed(replace(base, out_px=side))
-        size.add(float(pixels), seconds, pixels)
+        size.add(float(side), seconds, pixels)
     window = Panel("window", "window [px], stride 1", "output pixel")
     for n in settings.windows:
         seconds, pixels, _ = timed(replace(base, window=n, sigma=n / WIDTH))
@@ -141,7 +141,7 @@ def _draw(panels: Sequence[Panel], path: Path) -> Path:
         from matplotlib.figure import Figure as Picture
     except ImportError:
         raise MissingExtra("matplotlib", "plot", "drawing diagrams") from None
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context({**STYLE, "svg.fonttype": "none"}):
         picture = Picture(figsize=(10.5, 6.2), layout="constrained")
         grid = np.ravel(picture.subplots(2, 3))
         handles: dict[str, Any] = {}
@@ -152,9 +152,7 @@ def _draw(panels: Sequence[Panel], path: Path) -> Path:
                     panel.x, us, color=COLOURS[k], marker=MARKERS[k], markerfacecolor="none", linewidth=1.3
                 )
                 handles.setdefault(STAGES[stage], line)
-            axes.set_ylim(bottom=0)
-            if panel.title == "image size":
-                axes.set_xscale("log")
+            axes.set_ylim(0, 1.08 * max(map(max, panel.us.values())))
             axes.set_xlabel(panel.abscissa)
             axes.set_ylabel(f"us per {panel.work}")
             axes.set_title(panel.title)

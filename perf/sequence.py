@@ -90,8 +90,8 @@ def measure_sequence(settings: Sequence) -> Outcome:
     pixels = long[0].pixels / len(long[0].units)
     peaks = {frames: statistics.median(r.peak_mib for r in found) for frames, found in runs.items()}
     figures = (
-        Figure("time per frame", 1e3 * statistics.median(kept), "ms", note=f"{pixels:.0f} output pixels"),
-        Figure("time per output pixel", 1e6 * statistics.median(kept) / pixels, "us/px"),
+        Figure("time per frame", 1e3 * statistics.median(kept), "ms", note=f"images of {pixels:.0f} pixels"),
+        Figure("time per pixel of the image", 1e6 * statistics.median(kept) / pixels, "us/px"),
         Figure(f"the last third of frames {settings.first}..{settings.last} over the first", pace, "x", 1.1, low=0.9),
         Figure(f"peak memory of {settings.long} frames", peaks[settings.long], "MiB"),
         Figure(f"peak memory of {settings.short} frames", peaks[settings.short], "MiB"),
@@ -115,7 +115,7 @@ def measure_large(settings: Large) -> Outcome:
         Figure("memory planned for a unit", run.planned_mib, "MiB", cap_mib),
         Figure("bands of an image", run.bands),
         Figure("time per measured frame", run.seconds / settings.measured, "s", note="with reading and writing"),
-        Figure("time per output pixel", 1e6 * run.seconds / run.pixels, "us/px"),
+        Figure("time per pixel of the image", 1e6 * run.seconds / run.pixels, "us/px"),
         Figure("compiling or loading", run.compile_seconds, "s"),
     )
     note = f"{settings.measured} measured frames need {frames}: their filters are counted, too"
