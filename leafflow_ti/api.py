@@ -14,15 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti import __version__
+from leafflow_ti.background import Behind
+from leafflow_ti.bands import WRITE_BEHIND
 from leafflow_ti.capture import Capture, open_capture
 from leafflow_ti.config import RunConfig, load_config
 from leafflow_ti.errors import RunError
 from leafflow_ti.field import Field, status_counts
 from leafflow_ti.pipeline import Maps, Pipeline
 from leafflow_ti.plan import Plan, Unit, make_plan
-from leafflow_ti.progress import Progress, RunSummary
+from leafflow_ti.progress import Progress, RunSummary, Timings
 from leafflow_ti.results import ResultStore
 from leafflow_ti.runtime import Device, start
+from leafflow_ti.trace import active, span
 
 
 def plan_run(capture: Capture, config: RunConfig) -> Plan:
@@ -50,7 +53,8 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
         return estimate(capture, middle, **options)
     from leafflow_ti.kernels.engine import quick_front_end
 
-    device = _start(config)
+    began = time.perf_counter()
+    device = start_device(config)
     pipeline = Pipeline(plan, capture, device)
     shape = (len(plan.y), len(plan.x))
     maps: Maps = {name: np.full(shape, np.nan, np.float32) for name in plan.names}
@@ -63,7 +67,9 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
 
     with quick_front_end():
         pipeline.run(set(), deliver)
-    attrs = {**_provenance(plan, capture, device), "stage_seconds": pipeline.timings.seconds}
+    n, pixels = plan.n_units, status.size
+    timings = Timings(time.perf_counter() - began, pipeline.trace.seconds, n, pixels, 1.0, 1, str(device))
+    attrs = {**_provenance(plan, capture, device), "timings": timings.to_json()}
     return Field(maps, status, np.array(plan.y), np.array(plan.x), plan.frames[0], attrs)
 
 
@@ -78,46 +84,54 @@ def run(
 ) -> RunSummary:
     """Measure every frame of a capture into a results store.
 
-    ``resume`` goes on with an interrupted run of the same configuration and input; ``progress`` is called after
-    every unit. Raises ConfigError, InputError, DeviceError, RunError; UsageError if ``out`` exists and neither
-    option is given.
+    ``resume`` goes on with an interrupted run of the same configuration and input; ``progress`` is called after every
+    unit, by the thread that writes. Raises ConfigError, InputError, DeviceError, RunError; UsageError if ``out`` exists
+    and neither option is given.
     """
     began = time.perf_counter()
     if not isinstance(capture, Capture):
         capture = open_capture(capture)
     config = config or RunConfig()
     plan = make_plan(capture, config)
-    device = _start(config)
+    device = start_device(config)
     provenance = _provenance(plan, capture, device)
     store = _open_store(Path(out), plan, capture, provenance, resume, overwrite)
+    before = Timings.of(store.attrs.get("timings"))
     done = store.done()
+    capture.keep_decoded(plan.cache_bytes)
     pipeline = Pipeline(plan, capture, device)
     compile_seconds = pipeline.warm_up() if len(done) < plan.n_units else 0.0
-    todo = [u for u in plan.units() if u.index not in done]
-    pixels = {u.index: (u.rows.stop - u.rows.start) * len(plan.x) for u in todo}
-    total, finished, finished_pixels = sum(pixels.values()), 0, 0
+    todo = {u.index: (u.rows.stop - u.rows.start) * len(plan.x) for u in plan.units() if u.index not in done}
+    total, finished, pixels = sum(todo.values()), 0, 0
     computing = time.perf_counter()
 
-    def deliver(unit: Unit, maps: Maps, status: NDArray[np.uint8]) -> None:
-        nonlocal finished, finished_pixels
-        with pipeline.timings.of("write"):
-            store.write_unit(unit.index, unit.t_index, unit.rows, maps, status)
-        finished += 1
-        finished_pixels += pixels[unit.index]
-        if progress:
-            progress(Progress(finished, len(todo), finished_pixels, total, time.perf_counter() - computing))
+    def timings() -> Timings:
+        seconds, stages = time.perf_counter() - began, pipeline.trace.seconds
+        return Timings(seconds, stages, finished, pixels, finished / plan.bands, 1, str(device))
 
-    pipeline.run(done, deliver)
-    seconds = time.perf_counter() - began
-    store.finish({"seconds": seconds, "stage_seconds": pipeline.timings.seconds})
+    def write(result: tuple[Unit, Maps, NDArray[np.uint8]]) -> None:
+        nonlocal finished, pixels
+        unit, maps, status = result
+        with span("write", f"unit {unit.index}"):
+            store.write_unit(unit.index, unit.t_index, unit.rows, maps, status)
+            finished, pixels = finished + 1, pixels + todo[unit.index]
+            store.update_attrs({"timings": (before + timings()).to_json()})
+        if progress:
+            progress(Progress(finished, len(todo), pixels, total, time.perf_counter() - computing))
+
+    with active(pipeline.trace), Behind(write, WRITE_BEHIND) as writer:
+        pipeline.run(done, lambda *result: writer.put(result))
+    now = timings()
+    store.finish({"timings": (before + now).to_json()})
     counts: dict[str, int] = {}
     for t in range(len(plan.frames)):
         for name, n in status_counts(store.read("status", t)).items():
             counts[name] = counts.get(name, 0) + n
-    return RunSummary(seconds, compile_seconds, str(device), counts, pipeline.timings.seconds, str(out))
+    return RunSummary(now.seconds, compile_seconds, str(device), counts, now.stages, str(out))
 
 
-def _start(config: RunConfig) -> Device:
+def start_device(config: RunConfig) -> Device:
+    """The device that a configuration asks for; raises DeviceError."""
     threads = config.plan.threads
     return start(config.arch, config.precision, None if threads == "auto" else int(threads))
 
@@ -133,10 +147,16 @@ def _open_store(
                     f"{out} cannot be resumed: its {key} differs from this run's; use --overwrite, or another output"
                 )
         return store
+    return create_store(out, plan, provenance, capture.frame_interval_s, overwrite)
+
+
+def create_store(
+    out: Path, plan: Plan, attrs: dict[str, Any], interval_s: float | None = None, overwrite: bool = False
+) -> ResultStore:
+    """An empty results store for a plan; errors as of ``ResultStore.create``."""
     return ResultStore.create(
         out, frames=plan.frames, y=np.array(plan.y), x=np.array(plan.x), names=plan.names,
-        chunk=(1, plan.band_rows, len(plan.x)), attrs=provenance, interval_s=capture.frame_interval_s,
-        overwrite=overwrite,
+        chunk=(1, plan.band_rows, len(plan.x)), attrs=attrs, interval_s=interval_s, overwrite=overwrite,
     )  # fmt: skip
 
 

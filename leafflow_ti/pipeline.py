@@ -5,46 +5,30 @@ The engine knows no files of results: what becomes of a unit's maps is the calle
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
+import contextlib
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.capture import Capture
-from leafflow_ti.capture.images import read_gray
-from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import RangeEngine, Sample
+from leafflow_ti.reading import Box, Reader
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import EstimateStage, View
 from leafflow_ti.stages.prefilter import Prefilter
 from leafflow_ti.stages.tensor import Band, TensorStage
 from leafflow_ti.status import HAS_VALUE, Status
+from leafflow_ti.trace import Trace, active, span
 
 Maps = dict[str, NDArray[np.float32]]
-
-
-@dataclass
-class Timings:
-    """Seconds spent per stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def of(self, stage: str) -> Iterator[None]:
-        """Add the time of a block to one stage."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+_NO_IMAGES: NDArray[Any] = np.empty((0, 0, 0, 0), np.float32)
 
 
 @dataclass
@@ -76,18 +60,30 @@ class _Engine:
         return None if tensor is None else (tensor, own)
 
 
+@dataclass(frozen=True)
+class _Stay:
+    """An engine over one band. ``box``: block of images that it needs, with the prefilter's margin; ``allowed``
+    [rows, cols] of the block without it: pixels that may count; ``place``: of the computed rectangle among the rows
+    around the band; ``centre``: the block's pixels at the output positions."""
+
+    engine: _Engine
+    box: Box
+    allowed: NDArray[np.bool_]
+    place: tuple[slice, slice]
+    centre: tuple[slice, slice]
+
+
 class Pipeline:
     """Computes the units of a plan on a device.
 
-    ``timings`` holds the seconds of the stages ``compile``, ``read``, ``prefilter``, ``tensor`` and ``estimate``.
-    Raises ConfigError for a mask that does not fit the images.
+    ``trace`` holds the seconds of the stages. Raises ConfigError for a mask that does not fit the images.
     """
 
-    def __init__(self, plan: Plan, capture: Capture, device: Device):
+    def __init__(self, plan: Plan, capture: Capture, device: Device, trace: Trace | None = None):
         self.plan, self.capture, self.device = plan, capture, device
-        self.timings = Timings()
+        self.trace = trace or Trace()
+        self._reader = Reader(plan, capture, device.real("storage"))
         self._engines: dict[int, _Engine] = {}
-        self._mask = _read_mask(plan.config.output.mask, capture)
         # Output pixels of the plan and those around them; rows and columns below count along these.
         self._y, self._x = (_widened(r, n, plan.margin) for r, n in ((plan.y, capture.height), (plan.x, capture.width)))
         self._rows = self._measurable("y", self._y, capture.height, 1)
@@ -99,33 +95,51 @@ class Pipeline:
         """Compile every kernel of the plan on a tiny band; the seconds that it took."""
         from leafflow_ti.kernels.engine import quick_front_end
 
-        with self.timings.of("compile"), quick_front_end():
-            plan = self.plan
-            band = Band.of(plan.problem.sampling, 1, 1, plan.config.window.stride)
-            engine = self._make_engine(band)
-            shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
-            if engine.ranges:
-                shape = (*shape[:2], engine.ranges.outer.in_rows, engine.ranges.outer.in_cols)
-                engine.ranges.move(engine.estimate.view, (0, 0))
-            grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
-            ok = np.ones(shape[2:], bool)
+        # The work on the tiny band is no stage of its own: it all counts as compiling.
+        with active(None), self.trace.span("compile"), quick_front_end():
+            self._one_pixel(None)
+        return self.trace.seconds["compile"]
+
+    def least_seconds(self) -> dict[str, float]:
+        """Seconds per stage of one more frame of a band of one pixel, kernels compiled: launches and little else."""
+        trace = Trace(barrier=self.device.synchronize)
+        self._one_pixel(trace)
+        return trace.seconds
+
+    def _one_pixel(self, trace: Trace | None) -> None:
+        """Compute one pixel from random images until its windows are full, then one frame more for the trace."""
+        plan = self.plan
+        band = Band.of(plan.problem.sampling, 1, 1, plan.config.window.stride)
+        engine = self._make_engine(band)
+        shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
+        if engine.ranges:
+            shape = (*shape[:2], engine.ranges.outer.in_rows, engine.ranges.outer.in_cols)
+            engine.ranges.move(engine.estimate.view, (0, 0))
+        grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
+        ok = np.ones(shape[2:], bool)
+
+        def one_more() -> Any:
             sample = Sample(grey, ok, np.zeros(shape[2:], np.uint8))
             if engine.ranges:
                 sample = engine.ranges.sample(plan.frames[0], grey, ok, ok)
-            tensors = None
-            while tensors is None:
-                tensors = engine.push(sample)
-            engine.estimate(*tensors)
-            self.device.synchronize()
-        return self.timings.seconds["compile"]
+            return engine.push(sample)
+
+        while (tensors := one_more()) is None:
+            pass
+        engine.estimate(*tensors)
+        if trace is not None:
+            with active(trace):
+                engine.estimate(*one_more())
+        self.device.synchronize()
 
     def run(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
         """Compute every unit that is not ``done`` and hand over its maps [rows, columns] and status."""
         for band in range(self.plan.bands):
             pending = [t for t in range(len(self.plan.frames)) if self.plan.unit(t, band).index not in done]
             for first, last in _runs(pending):
-                for unit, maps, status in self._sequence(band, first, last):
-                    deliver(unit, maps, status)
+                with active(self.trace), contextlib.closing(self._sequence(band, first, last)) as units:
+                    for unit, maps, status in units:
+                        deliver(unit, maps, status)
 
     def _make_engine(self, band: Band) -> _Engine:
         plan, problem = self.plan, self.plan.problem
@@ -175,19 +189,42 @@ class Pipeline:
             self._x[corner[1]], self._y[corner[0]], plan.x.step, band.rows, band.cols, pitch,
         )  # fmt: skip
 
-    def _sequence(self, index: int, first: int, last: int) -> Iterator[tuple[Unit, Maps, NDArray[np.uint8]]]:
+    def _sequence(
+        self, index: int, first: int, last: int
+    ) -> Generator[tuple[Unit, Maps, NDArray[np.uint8]], None, None]:
         """The units of one band for the output frames first..last, sliding through the sequence.
 
         Only the rectangle of measurable pixels is computed; what lies around it is border.
         """
         plan = self.plan
-        whole = self._around(plan.band(index))
-        rows = slice(max(whole.start, self._rows.start), min(whole.stop, self._rows.stop))
-        cols = self._cols
-        if rows.start >= rows.stop or cols.start >= cols.stop:
+        rows, cols = self.extent(index)
+        if rows.start == rows.stop or cols.start == cols.stop:
             for t_index in range(first, last + 1):
                 yield plan.unit(t_index, index), *self._frame_of(index, {}, None, None)
             return
+        stay = self._move(index)
+        engine, latency = stay.engine, stay.engine.tensor.latency
+        frames = range(plan.frames[first] - latency, plan.frames[last] + latency + 1)
+        waiting: deque[Sample] = deque(maxlen=latency + 1)
+        with contextlib.closing(self._reader.blocks(frames, stay.box)) as blocks:
+            for t in frames:
+                with span("host", f"frame {t}"):
+                    sample = self._sample(stay, t, *next(blocks))
+                    tensors = engine.push(sample)
+                    waiting.append(replace(sample, block=_NO_IMAGES))  # its images may go
+                    del sample
+                    if tensors is None:
+                        continue
+                    self.device.synchronize()
+                    with span("fit"):
+                        maps, status = self._maps(engine.estimate(*tensors), waiting[0], stay.centre)
+                        result = self._frame_of(index, maps, status, stay.place)
+                yield plan.unit(first + t - latency - plan.frames[first], index), *result
+
+    def _move(self, index: int) -> _Stay:
+        """Bring an engine, all frames forgotten, to the measurable rectangle of a band."""
+        plan = self.plan
+        whole, (rows, cols) = self._around(plan.band(index)), self.extent(index)
         band = Band.of(plan.problem.sampling, rows.stop - rows.start, cols.stop - cols.start, plan.x.step)
         if band.rows not in self._engines:
             self._engines.clear()  # bands come in order: one engine's memory at a time
@@ -199,29 +236,24 @@ class Pipeline:
         centre = _centres(band)
         if engine.ranges:
             band, corner = engine.ranges.outer, engine.ranges.move(engine.estimate.view, corner)
-        allowed = self._inside(band, corner)
+        inner = Box(*corner, band.in_rows, band.in_cols)
+        margin = engine.prefilter.radius if engine.prefilter else 0
         place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
-        latency = engine.tensor.latency
-        samples: dict[int, Sample] = {}
-        for t in range(plan.frames[first] - latency, plan.frames[last] + latency + 1):
-            block, finite = self._read(t, band, corner, engine.prefilter)
-            with self.timings.of("tensor"):
-                if engine.ranges:
-                    samples[t] = engine.ranges.sample(t, block, allowed & finite, finite)
-                else:
-                    status = np.where(finite, np.uint8(Status.OK), np.uint8(Status.NOT_FINITE))
-                    samples[t] = Sample(block, allowed & finite, status)
-                tensors = engine.push(samples[t])
-                self.device.synchronize()
-            frame = t - latency
-            samples.pop(frame - 1, None)
-            if tensors is None:
-                continue
-            with self.timings.of("estimate"):
-                maps, status = self._maps(engine.estimate(*tensors), samples[frame], centre)
-                unit = plan.unit(first + frame - plan.frames[first], index)
-                result = self._frame_of(index, maps, status, place)
-            yield unit, *result
+        return _Stay(engine, inner.widened(margin), self._reader.inside(inner), place, centre)
+
+    def read_alone(self, index: int, frames: range) -> dict[str, float]:
+        """Seconds of reading and of decoding a band's images of these frames while nothing else goes on."""
+        trace, box = Trace(), self._move(index).box
+        with active(trace), contextlib.closing(self._reader.blocks(frames, box, ahead=0)) as blocks:
+            for _ in blocks:
+                pass
+        return trace.seconds
+
+    def extent(self, index: int) -> tuple[slice, slice]:
+        """Rows and columns of a band that are computed, those for the sake of others included; empty: all border."""
+        whole = self._around(self.plan.band(index))
+        first = max(whole.start, self._rows.start)
+        return slice(first, max(first, min(whole.stop, self._rows.stop))), self._cols
 
     def _around(self, rows: slice) -> slice:
         """Rows of the plan, and those that are computed around them."""
@@ -241,8 +273,8 @@ class Pipeline:
         framed = {name: np.full(shape, np.nan, np.float32) for name in self._names}
         if place is not None and status is not None:
             codes[place] = status
-        if self._mask is not None:
-            codes[~self._mask[np.ix_(y, x)]] = Status.MASKED
+        if self._reader.mask is not None:
+            codes[~self._reader.mask[np.ix_(y, x)]] = Status.MASKED
         if place is not None:
             empty = ~np.isin(codes[place], HAS_VALUE)
             for name, values in maps.items():
@@ -256,65 +288,29 @@ class Pipeline:
         inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
         return {n: framed[n][inner].copy() for n in plan.names}, codes[inner].copy()
 
-    def _read(
-        self, t: int, band: Band, corner: tuple[int, int], prefilter: Prefilter | None
+    def _sample(self, stay: _Stay, t: int, block: NDArray[Any], finite: NDArray[np.bool_]) -> Sample:
+        """What the tensor stages take: one frame's images [sy, sx, rows, cols] of a stay, prefiltered."""
+        engine, allowed = stay.engine, stay.allowed
+        if engine.prefilter:
+            block, finite = self._prefiltered(engine.prefilter, t, block, finite, stay.box)
+        everywhere = np.asarray(finite.all(axis=(0, 1)))
+        if engine.ranges:
+            return engine.ranges.sample(t, block, allowed & everywhere, everywhere)
+        status = np.where(everywhere, np.uint8(Status.OK), np.uint8(Status.NOT_FINITE))
+        return Sample(block, allowed & everywhere, status)
+
+    def _prefiltered(
+        self, prefilter: Prefilter, t: int, block: NDArray[Any], finite: NDArray[np.bool_], box: Box
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Preshifted, prefiltered block [sy, sx, in_rows, in_cols], 0 where not finite, and where all were finite."""
-        radius = prefilter.radius if prefilter else 0
-        (y0, x0), (rows, cols) = (n - radius for n in corner), (n + 2 * radius for n in (band.in_rows, band.in_cols))
-        with self.timings.of("read"):
-            block = self.capture.block(
-                [t], *self.plan.cameras, y0, y0 + rows, x0, x0 + cols, self.plan.preshift, self.device.real("storage")
-            )[0]
-            finite = np.isfinite(block)
-        if prefilter:
-            with self.timings.of("prefilter"):
-                in_y, in_x = self._seen(y0 + np.arange(rows), x0 + np.arange(cols))
-                valid = finite & in_y[:, None, :, None] & in_x[None, :, None, :]
-                if self.plan.config.filters.prefilter == "homomorphic":
-                    self._require_positive(block, valid, t, (y0, x0))
-                stack = (-1, rows, cols)
-                inner = slice(radius, rows - radius), slice(radius, cols - radius)
-                finite = finite[:, :, *inner]
-                block = prefilter(block.reshape(stack), valid.reshape(stack)).reshape(finite.shape)
-        elif not finite.all():
-            block = np.where(finite, block, 0)
-        return block, finite.all(axis=(0, 1))
-
-    def _require_positive(self, block: NDArray[Any], valid: NDArray[np.bool_], t: int, corner: tuple[int, int]) -> None:
-        """Raise InputError for the first grey value that has no logarithm."""
-        wrong = valid & (block <= 0)
-        if not wrong.any():
-            return
-        j, k, row, col = (int(n) for n in np.argwhere(wrong)[0])
-        sy, sx = self.plan.cameras[0][j], self.plan.cameras[1][k]
-        x = corner[1] + col + self.plan.preshift[0] * (sx - self.capture.reference[1])
-        y = corner[0] + row + self.plan.preshift[1] * (sy - self.capture.reference[0])
-        raise InputError(
-            f"{self.capture.image_name(t, sy, sx)}: grey value {block[j, k, row, col]:g} at pixel x = {x}, y = {y}: "
-            "prefilter homomorphic takes logarithms and needs values above 0: choose prefilter highpass, or add an "
-            "offset to the images"
-        )
-
-    def _seen(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which rows ``y`` [cameras along y, n] and columns ``x`` [cameras along x, n] of blocks lie inside images."""
-        capture, shift = self.capture, self.plan.preshift
-        rows, cols = (
-            np.array(cameras)[:, None] - n for cameras, n in zip(self.plan.cameras, capture.reference, strict=True)
-        )
-        in_y, in_x = y + shift[1] * rows, x + shift[0] * cols
-        return (in_y >= 0) & (in_y < capture.height), (in_x >= 0) & (in_x < capture.width)
-
-    def _inside(self, band: Band, corner: tuple[int, int]) -> NDArray[np.bool_]:
-        """Where every camera sees its image and the mask allows a measurement: [in_rows, in_cols]."""
-        capture = self.capture
-        y, x = corner[0] + np.arange(band.in_rows), corner[1] + np.arange(band.in_cols)
-        in_y, in_x = (np.logical_and.reduce(seen) for seen in self._seen(y, x))
-        inside = in_y[:, None] & in_x
-        if self._mask is None:
-            return np.asarray(inside)
-        kept = self._mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
-        return np.asarray(inside & kept)
+        """The block without the prefilter's margin, and where it is finite."""
+        with span("prefilter"):
+            in_y, in_x = self._reader.seen(box.y + np.arange(box.rows), box.x + np.arange(box.cols))
+            valid = finite & in_y[:, None, :, None] & in_x[None, :, None, :]
+            if self.plan.config.filters.prefilter == "homomorphic":
+                self._reader.require_positive(block, valid, t, box)
+            stack, r = (-1, box.rows, box.cols), prefilter.radius
+            finite = finite[:, :, r : box.rows - r, r : box.cols - r]
+            return prefilter(block.reshape(stack), valid.reshape(stack)).reshape(finite.shape), finite
 
     def _maps(
         self, planes: NDArray[Any], sample: Sample, centre: tuple[slice, slice]
@@ -372,13 +368,3 @@ def _runs(indices: list[int]) -> Iterator[tuple[int, int]]:
         if i == len(indices) or indices[i] != indices[i - 1] + 1:
             yield indices[start], indices[i - 1]
             start = i
-
-
-def _read_mask(path: Path | None, capture: Capture) -> NDArray[np.bool_] | None:
-    if path is None:
-        return None
-    mask: NDArray[np.bool_] = np.asarray(read_gray(path)) != 0
-    if mask.shape != (capture.height, capture.width):
-        found, wanted = (f"{shape[1]} x {shape[0]}" for shape in (mask.shape, (capture.height, capture.width)))
-        raise ConfigError(f"{path}: a mask of {found} pixels for images of {wanted}: make it the same size")
-    return mask

@@ -7,23 +7,18 @@ for range flow the noise of one image.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
-
-from leafflow_ti.capture import Capture, Geometry, find_preshift
+from leafflow_ti.bands import READ_AHEAD, Demand, choose_bands, usable_memory
+from leafflow_ti.capture import DEFAULT_CACHE_BYTES, ArrayCapture, Capture, Geometry, find_preshift
 from leafflow_ti.config import RunConfig, resolve_model
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import choose_filter_set, filter_set
 from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set, parse_rows
 from leafflow_ti.range_plan import RangePlan, range_problem
 from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.prefilter import prefilter_bytes
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
-from leafflow_ti.stages.tensor import Band, band_bytes
 
-BAND_PIXELS = 1 << 17
-"""Output pixels of a unit where memory allows: large enough to amortise halos, small enough to answer an interrupt."""
 MOTION_NAMES = tuple(f"{q}_{a}" for q in ("velocity", "rotation", "acceleration") for a in "xyz")
 
 
@@ -54,7 +49,11 @@ class Plan:
     x: range
     band_rows: int
     bytes: int
-    """Memory of the largest unit's arrays."""
+    """Memory of the largest unit's arrays, of the frames read ahead, and of the units that wait to be written."""
+    read_ahead: int
+    """Frames that are read before they are needed, while the device computes."""
+    cache_bytes: int
+    """Of these bytes, those of decoded images: kept where several bands need them and all of them fit, else 0."""
     ranges: RangePlan | None = None
 
     def reach(self, axis: str) -> int:
@@ -167,7 +166,8 @@ class Plan:
             f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.config.window.stride}: "
             f"{', '.join(self.names)}",
             f"units       {self.n_units}: {self.bands} bands of up to {self.band_rows} rows per frame",
-            f"memory      {self.bytes / 2**20:.0f} MiB for one unit, limit {limit / 2**20:.0f} MiB",
+            f"memory      {self.bytes / 2**20:.0f} MiB for one unit, {self.read_ahead} frames read ahead, "
+            f"{self.cache_bytes / 2**20:.0f} MiB of them decoded images; limit {limit / 2**20:.0f} MiB",
             f"disk        at most {pixels * (4 * len(self.names) + 1) / 2**20:.0f} MiB",
         ]
         return "\n".join(lines)
@@ -213,12 +213,18 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     x, y = range(x0, x1, config.window.stride), range(y0, y1, config.window.stride)
     grid = (ranges.depth if ranges and ranges.depth else problem).sampling
     cameras = _cameras(grid, problem.own_flows, *capture.reference)
-    n_cameras = len(cameras[0]) * len(cameras[1])
-    band_rows, memory = _band_rows(config, problem, layout, ranges, n_cameras, len(y), len(x))
-    return Plan(
+    plan = Plan(
         config, name, problem, layout, _geometry(capture),
-        cameras, preshift, frames, y, x, band_rows, memory, ranges,
+        cameras, preshift, frames, y, x, len(y), 0, 0, 0, ranges,
     )  # fmt: skip
+    depths = (0,) if isinstance(capture, ArrayCapture) else range(READ_AHEAD, -1, -1)
+    demand = Demand(config, problem, layout, ranges, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))
+    band_rows, memory, ahead = choose_bands(demand, len(y), depths)
+    plan = replace(plan, band_rows=band_rows, bytes=memory, read_ahead=ahead)
+    cache = capture.cacheable_bytes if plan.bands > 1 else 0
+    if cache > min(DEFAULT_CACHE_BYTES, usable_memory(config) - memory):
+        cache = 0
+    return replace(plan, bytes=memory + cache, cache_bytes=cache)
 
 
 def _sampling(capture: Capture, config: RunConfig, cameras: str, time: bool) -> Sampling:
@@ -383,50 +389,3 @@ def _geometry(capture: Capture) -> Geometry:
 def _preshift(capture: Capture, config: RunConfig) -> tuple[int, int]:
     found = find_preshift(capture) if config.preshift == "auto" else config.preshift
     return (found[0] if capture.n_cols > 1 else 0, found[1] if capture.n_rows > 1 else 0)
-
-
-def _band_rows(
-    config: RunConfig,
-    problem: Problem,
-    layout: TensorLayout,
-    ranges: RangePlan | None,
-    n_cameras: int,
-    rows: int,
-    cols: int,
-) -> tuple[int, int]:
-    """Rows of a unit, and the memory that it takes."""
-    itemsize = 4 if config.precision == "f32" else 8
-
-    def size(n: int) -> int:
-        # Two more rows and columns for the growth at the edges.
-        band = Band.of(problem.sampling, n + 2, cols + 2, config.window.stride)
-        total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize)
-        read = band
-        if ranges and ranges.depth and ranges.layout:
-            depth = ranges.depth
-            read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
-            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize)
-        own = problem.own_flows
-        if own:
-            total += len(own.steps) * band_bytes(
-                own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize
-            )
-        if config.filters.prefilter != "none":
-            total += prefilter_bytes(config.filters.sigma_pre, n_cameras, read.in_rows, read.in_cols, itemsize)
-        return total
-
-    limit = int(0.8 * config.plan.max_memory)
-    if config.plan.tile != "auto":
-        chosen = min(int(config.plan.tile), rows)
-    else:
-        chosen = int(np.clip(BAND_PIXELS // cols, 16, rows)) if rows > 16 else rows
-        while chosen > 1 and size(chosen) > limit:
-            chosen = max(1, chosen * 3 // 4)
-        # Bands of equal height: the last one should not be a sliver.
-        chosen = -(-rows // -(-rows // chosen))
-    if size(chosen) > limit:
-        raise ConfigError(
-            f"a unit of {chosen} rows needs {size(chosen) / 2**20:.0f} MiB, 80 % of plan.max_memory are "
-            f"{limit / 2**20:.0f} MiB: raise it, lower plan.tile, or use a stride, a roi, a smaller window"
-        )
-    return chosen, size(chosen)

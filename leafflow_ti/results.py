@@ -9,24 +9,35 @@ list the folders of groups, where a foreign entry would be reported, but never t
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import zarr
+from numcodecs import Zstd
 from numpy.typing import ArrayLike, NDArray
+from zarr.codecs import ZstdCodec
 from zarr.errors import NodeNotFoundError
 
 from leafflow_ti.errors import InputError, RunError, UsageError
 from leafflow_ti.field import QUANTITIES, Field, map_attributes
 from leafflow_ti.status import Status
 
+WRITERS = 16
+"""Chunks of a unit that are written together: the disk forces them out at once, and while kernels run, which hold the
+interpreter, each of the threads gets on a step between two of them."""
 FORMAT = 1
 """Version of the layout, in the attribute ``leafflow_ti_format`` by which a store is recognised."""
+
+_COMPRESSOR = ZstdCodec(level=0, checksum=False)
+_METADATA = "zarr.json"
+"""The group's metadata file, attributes included (Zarr v3)."""
 
 _COORDINATES: dict[str, dict[str, Any]] = {
     "t": {"long_name": "index of the reference frame", "units": "frame"},
@@ -99,6 +110,8 @@ class ResultStore:
                         fill_value=int(Status.NOT_COMPUTED) if name == "status" else float("nan"),
                         dimension_names=list(coordinates),
                         attributes=attributes,
+                        compressors=_COMPRESSOR,
+                        filters=None,
                     )
                 (scratch / "status" / ".done").mkdir()
                 if path.exists():
@@ -128,8 +141,22 @@ class ResultStore:
 
     @property
     def attrs(self) -> dict[str, Any]:
-        """Attributes of the store: resolved configuration, versions, device, fingerprints, timings."""
-        return dict(self._group.attrs)
+        """Attributes of the store as they are now: resolved configuration, versions, device, fingerprints, timings."""
+        found: dict[str, Any] = json.loads((self.path / _METADATA).read_text(encoding="utf-8"))["attributes"]
+        return found
+
+    def update_attrs(self, attrs: Mapping[str, Any]) -> None:
+        """Set attributes; whoever reads meanwhile, or after a kill, finds the old ones or the new ones.
+
+        Raises RunError when the store cannot be written.
+        """
+        with _writing(self.path):
+            metadata = json.loads((self.path / _METADATA).read_text(encoding="utf-8"))
+            metadata["attributes"].update(attrs)
+            scratch = self.path / "status" / ".done" / f".{_METADATA}"
+            scratch.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
+            _flush(scratch)
+            scratch.replace(self.path / _METADATA)
 
     @property
     def interval_s(self) -> float | None:
@@ -170,11 +197,33 @@ class ResultStore:
         if wrong:
             raise ValueError(f"unit {unit} needs the shape {shape}; {wrong[0]} has {arrays[wrong[0]].shape}")
         with _writing(self.path):
-            for name, values in arrays.items():
-                self._arrays[name][t_index, rows] = values
-                # A chunk that holds nothing but the fill value has no file.
-                _flush(self.path / name / "c" / str(t_index) / str(band) / "0", missing_ok=True)
+            with ThreadPoolExecutor(WRITERS) as pool:
+                for _ in pool.map(lambda item: self._write_chunk(t_index, band, *item), arrays.items()):
+                    pass
             self._mark(unit)
+
+    def _write_chunk(self, t_index: int, band: int, name: str, values: NDArray[Any]) -> None:
+        """Write one chunk file as the format prescribes, forced to the disk, without the library's own threads.
+
+        The last band's chunk is filled up to the height of the others; one that holds nothing but the fill value has
+        no file.
+        """
+        array = self._arrays[name]
+        if array.compressors != (_COMPRESSOR,) or array.filters:
+            raise RunError(f"{self.path}: {name} is stored in a way that this program does not write: use --overwrite")
+        chunk = np.full(array.chunks[1:], array.fill_value, array.dtype)
+        chunk[: len(values)] = values
+        folder = self.path / name / "c" / str(t_index) / str(band)
+        if np.array_equal(chunk, np.broadcast_to(array.fill_value, chunk.shape), equal_nan=chunk.dtype.kind == "f"):
+            (folder / "0").unlink(missing_ok=True)
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        scratch = folder / ".0"
+        with scratch.open("wb") as file:
+            file.write(Zstd(level=_COMPRESSOR.level).encode(chunk.astype(chunk.dtype.newbyteorder("<"), copy=False)))
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(folder / "0")
 
     def _mark(self, unit: int) -> None:
         folder = self.path / "status" / ".done"
@@ -203,15 +252,14 @@ class ResultStore:
         return Field(maps, self.read("status", t_index), self.y, self.x, self.frames[t_index], self.attrs)
 
     def finish(self, attrs: Mapping[str, Any]) -> None:
-        """Add the attributes known at the end (timings, device).
+        """Set the attributes known at the end.
 
         Raises RunError when units are missing or the store cannot be written.
         """
         missing = self.n_units - len(self.done())
         if missing:
             raise RunError(f"{self.path}: {missing} of {self.n_units} units are not done: run again with --resume")
-        with _writing(self.path):
-            self._group.update_attributes(dict(attrs))
+        self.update_attrs(attrs)
 
 
 def _open_group(path: Path) -> zarr.Group | None:
@@ -241,16 +289,11 @@ def _writing(path: Path) -> Iterator[None]:
         raise RunError(f"{path}: cannot be written ({reason}): mend that, then run again with --resume") from error
 
 
-def _flush(path: Path, missing_ok: bool = False) -> None:
+def _flush(path: Path) -> None:
     """Force a file, or the entries of a folder, to the disk."""
     if path.is_dir() and os.name == "nt":  # Windows opens no folders and needs no such step
         return
-    try:
-        handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    except FileNotFoundError:
-        if missing_ok:
-            return
-        raise
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(handle)
     finally:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 ARCHES = ("cuda", "metal", "vulkan", "cpu")
 PLANE_LANES = 64
-DENSE_LANES = {"f32": 32, "f64": 16}
+DENSE_LANES = {"f32": 16, "f64": 16}
 ALIGNMENT = 256
 """Bytes: whole vectors are loaded from aligned addresses."""
 _lock = threading.Lock()

@@ -7,6 +7,7 @@ alone costs A for each of the frames of its window. Kernels are compiled before;
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterable
@@ -112,6 +113,7 @@ class Stages:
     plan: Plan
     tensor: TensorStage
     estimate: EstimateStage
+    null_space: EstimateStage
     blocks: list[Array]
 
     @classmethod
@@ -120,7 +122,8 @@ class Stages:
         problem = plan.problem
         band = Band.of(problem.sampling, len(plan.y), len(plan.x), plan.config.window.stride)
         tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band)
-        estimate = EstimateStage(device, problem, plan.layout, _view(plan, band, tensor.out_pitch))
+        view = _view(plan, band, tensor.out_pitch)
+        estimate = EstimateStage(device, problem, plan.layout, view)
         y0, x0 = plan.y.start - band.halo_y, plan.x.start - band.halo_x
         blocks = [
             capture.block(
@@ -128,7 +131,7 @@ class Stages:
             )[0]
             for t in range(capture.n_frames)
         ]
-        return cls(device, plan, tensor, estimate, blocks)
+        return cls(device, plan, tensor, estimate, _up_to_parameters(device, plan, view), blocks)
 
     def push(self, frames: Iterable[Array]) -> tuple[list[float], Any]:
         """Seconds of every frame pushed into an empty window, and the last tensor."""
@@ -159,28 +162,15 @@ class Stages:
             window_frames,
         )  # fmt: skip
 
-    def null_space(self, tensor: Any) -> None:
-        """The part of the estimate up to the flow parameters, batch by batch."""
-        from leafflow_ti.stages.estimators import ESTIMATORS
 
-        stage, view = self.estimate, self.estimate.view
-        tables, lanes = stage.reference, self.device.dense.lanes
-        n_pixels = view.rows * view.pitch
-        for first in range(0, n_pixels // lanes, stage._groups):
-            groups = stage._batch_groups = min(stage._groups, n_pixels // lanes - first)
-            step, stride = (stage.layout.n_elements * lanes, lanes) if not self.device.gpu else (1, groups)
+def _up_to_parameters(device: Device, plan: Plan, view: View) -> EstimateStage:
+    """The part of the estimate up to the flow parameters and their residuals; it writes no maps."""
+    from leafflow_ti.kernels.stages import Stage
 
-            def launch(
-                kernel: Any, value: Any = None, at: tuple[int, int, int, int] = (first, groups, step, stride)
-            ) -> None:
-                first, groups, step, stride = at
-                kernel(
-                    first * lanes, n_pixels, groups, step, stride, 0, self.device.tasks(groups), tables.on_device[0],
-                    tables.on_device[1] if value is None else value, tensor, stage._workspace, stage._maps,
-                )  # fmt: skip
-
-            ESTIMATORS[self.plan.problem.estimator](stage, tables)(launch)
-        self.device.synchronize()
+    stage = EstimateStage(device, plan.problem, plan.layout, view)
+    stage._steps = list(itertools.takewhile(lambda step: step.stage != Stage.CLEAN, stage._steps))
+    stage.set_view(view)
+    return stage
 
 
 def _view(plan: Plan, band: Band, pitch: int) -> View:

@@ -71,7 +71,7 @@ def measure(settings: Settings) -> Outcome:
             costs.append(
                 command(["run", str(capture), "-o", str(out), "--no-quicklook", "--quiet", *settings.options], cache)
             )
-            compiling.append(float(ResultStore.open(out).attrs["stage_seconds"]["compile"]))
+            compiling.append(float(ResultStore.open(out).attrs["timings"]["stages"]["compile"]))
         size = sum(file.stat().st_size for file in cache.rglob("*") if file.is_file())
     first, *later = costs
     best = min(later, key=lambda cost: cost.wall)

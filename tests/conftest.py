@@ -258,10 +258,12 @@ class Bench:
         """Run the per-pixel stages; ``motion`` None: without the motion fit.
 
         ``without``: own flows (by number) that are left out; ``lost``: own flows whose windows hold nothing.
+        ``apart``: as ``EstimateStage`` has it; without it, only the maps are right.
         """
         from leafflow_ti.kernels.workspace import Region
 
         tensors: list[Any] = []
+        apart = bool(options.pop("apart", True))
         if motion is not None:
             model = MODELS[self.model]
             offsets, use_range = parse_rows(rows if model.reference_rows else "2d", self.model, motion, self.columns)
@@ -282,17 +284,19 @@ class Bench:
         problem = Problem(self.columns, self.sampling, **options)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("leafflow_ti.stages.estimate.BATCH_BYTES", 64 << 20)  # one batch: its workspace is looked at
-            stage = EstimateStage(self.device, problem, self.layout, self.view)
+            stage = EstimateStage(self.device, problem, self.layout, self.view, apart=apart)
         planes = np.array(stage(self._tensor[1], tensors))
         k, flow = self.columns.n_time_like, self.columns.n_flow
+        if not apart:
+            return Estimated(problem, planes, np.empty(0), np.empty(0))
         parameters = self._region(stage, Region.PARAMETERS, k * flow)
         variance = self._region(stage, Region.VARIANCE, k)
         return Estimated(problem, planes, parameters.reshape(*parameters.shape[:2], k, flow), variance)
 
     def _region(self, stage: EstimateStage, region: int, size: int) -> np.ndarray:
         """A region of the workspace, [rows, cols, size]."""
-        lanes, pixels = self.device.dense.lanes, self.band.rows * stage.view.pitch
-        groups, n, first = pixels // lanes, stage.layout.n_elements, stage.layout.offsets[region]
+        lanes, groups = self.device.dense.lanes, self.band.rows * stage._row_groups
+        pixels, n, first = groups * lanes, stage.layout.n_elements, stage.layout.offsets[region]
         assert stage._groups >= groups, "the block is too large to be one batch"
         workspace = np.array(self.device.host(stage._workspace))[: n * pixels]
         # On the CPU the lanes of a group are neighbours, on a GPU the groups are: see kernels/dense.py.

@@ -229,6 +229,34 @@ def test_cache_forgets_the_least_recently_used() -> None:
         load("a")[0] = 1
 
 
+def test_cache_with_a_lower_limit_forgets_at_once() -> None:
+    cache = ImageCache(limit=20)
+    for key in "ab":
+        cache.get(key, lambda: np.zeros(8, np.uint8))
+    cache.set_limit(15)
+    assert cache.used == 8
+    assert cache.get("b", lambda: np.ones(8, np.uint8)).sum() == 0  # the older one went
+    cache.set_limit(0)
+    assert cache.get("c", lambda: np.ones(8, np.uint8)).sum() == 8
+    assert cache.used == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "worth"), [({}, 0), ({"compression": "zlib", "rowsperstrip": 5}, 0), ({"compression": "zlib"}, 1)]
+)
+def test_only_images_that_are_decoded_whole_are_worth_keeping(
+    tmp_path: Path, options: dict[str, object], worth: int
+) -> None:
+    _write_files(tmp_path, **options)
+    _describe(tmp_path, FILES)
+    capture = open_capture(tmp_path)
+    assert capture.cacheable_bytes == worth * IMAGES.nbytes
+    capture.block(range(3), range(2), range(4), 2, 15, 3, 20)
+    assert capture._cache.used == worth * IMAGES.nbytes
+    capture.keep_decoded(0)
+    assert capture._cache.used == 0
+
+
 def test_a_failed_load_can_be_tried_again() -> None:
     cache = ImageCache(limit=20)
 

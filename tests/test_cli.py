@@ -21,7 +21,7 @@ from leafflow_ti import __version__, config, errors
 from leafflow_ti.cli import main as cli
 from leafflow_ti.cli import options
 from leafflow_ti.cli.progress import ProgressLine, format_duration, format_progress, format_rate
-from leafflow_ti.progress import Progress, RunSummary
+from leafflow_ti.progress import Progress, RunSummary, Timings
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import ADVICE, Status
 
@@ -58,7 +58,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert call("--help") == 0
     text = capsys.readouterr().out
     assert all(f"\n  {name} " in text for name in cli.COMMANDS)
-    assert set(cli.COMMANDS) == {"simulate", "run", "evaluate", "info", "demo"}
+    assert set(cli.COMMANDS) == {"simulate", "run", "evaluate", "profile", "info", "demo"}
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
@@ -421,6 +421,24 @@ def test_info_of_results(api: FakeApi, capture: Path, tmp_path: Path, capsys: py
     facts = json.loads(capsys.readouterr().out)
     assert facts["maps"]["depth"] == {"units": "mm", "min": 1000.0, "median": 1000.0, "max": 1000.0}
     assert facts["status"] == {"ok": 48 * 64}
+
+
+def test_info_tells_what_the_units_have_cost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = ResultStore.create(
+        tmp_path / "o.zarr", frames=[0], y=[0, 1], x=[0, 1, 2], names=["depth"], chunk=(1, 1, 3), attrs={}
+    )
+    first = Timings(2.0, {"compile": 1.0, "solve": 0.5}, 1, 3, 0.5, 1, "cpu")
+    second = Timings(4.0, {"solve": 0.25, "write": 2.0}, 1, 3, 0.5, 1, "vulkan")
+    store.update_attrs({"timings": (first + second).to_json()})
+    assert call("info", tmp_path / "o.zarr") == 0
+    text = capsys.readouterr().out
+    assert "time         6 s in 2 runs on vulkan: 2 units, 1 px/s" in text
+    assert "stages       compile 1 s, solve 0.75 s, write 2 s (" in text
+    assert "\ntimings\n" not in text
+    assert call("info", tmp_path / "o.zarr", "--json") == 0
+    stored = json.loads(capsys.readouterr().out)["attributes"]["timings"]
+    assert stored["pixels_per_second"] == 1.0
+    assert Timings.of(stored) == first + second
 
 
 def test_info_of_unfinished_results_advises_to_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -102,7 +102,25 @@ def test_every_type_and_layout_is_exact(tmp_path: Path, dtype: str, layout: str)
     window = read_window(path, 0, "luminance", 5, 39, 11, 34)
     assert window.dtype == kind.newbyteorder("=")
     np.testing.assert_array_equal(window, image[5:39, 11:34])
-    assert probe(path).windowed == (layout != "zlib")
+    assert probe(path).windowed == (options != {"compression": "zlib"})  # that is one strip for the whole image
+
+
+def test_window_decodes_the_strips_that_it_touches(tmp_path: Path) -> None:
+    """Forty rows in strips of eight, the second and the last of which are damaged."""
+    image = RNG.integers(0, 255, (40, 50), np.uint8)
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, image, compression="zlib", rowsperstrip=8)
+    data = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as tif:
+        page = tif.pages[0]
+        assert isinstance(page, tifffile.TiffPage)
+        for strip in (1, 4):
+            start, count = page.dataoffsets[strip], page.databytecounts[strip]
+            data[start : start + count] = bytes(count)
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_window(path, 0, "luminance", 17, 31, 3, 9), image[17:31, 3:9])
+    with pytest.raises(InputError, match="cannot be decoded"):
+        read_window(path, 0, "luminance", 15, 31, 3, 9)
 
 
 @pytest.mark.parametrize("planar", ["contig", "separate"])

@@ -16,15 +16,16 @@ import leafflow_ti
 PACKAGE = Path(leafflow_ti.__file__).parent
 
 LAYERS: dict[str, int] = {
-    **dict.fromkeys(("errors", "status", "progress"), 1),
+    **dict.fromkeys(("errors", "status", "progress", "trace", "background"), 1),
     **dict.fromkeys(("kernels",), 2),
     **dict.fromkeys(("capture", "models", "config", "geometry", "field", "filters", "sampling", "range_flow"), 3),
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
     **dict.fromkeys(("growth",), 5),
-    **dict.fromkeys(("plan", "pipeline", "range_plan", "range_source", "range_engine", "results", "work"), 6),
-    **dict.fromkeys(("quicklook", "api"), 7),
+    **dict.fromkeys(("bands", "plan", "reading", "pipeline", "results", "work"), 6),
+    **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
+    **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases"), 7),
     **dict.fromkeys(("cli",), 8),
 }
 """Part of the package -> layer. A part imports from lower layers and, without cycles, from its own."""

@@ -5,21 +5,30 @@ from __future__ import annotations
 import hashlib
 import importlib
 import os
+import shutil
 import subprocess
 import sys
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 import leafflow_ti as lf
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import RunConfig, load_config
-from leafflow_ti.progress import Progress
+from leafflow_ti.errors import InputError
+from leafflow_ti.models import MODELS
+from leafflow_ti.plan import Plan
+from leafflow_ti.progress import Progress, Timings
+from leafflow_ti.runtime import start
 from leafflow_ti.stages.tensor import OUTPUT_PLANES
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import PlaneScene, render, truth
+from leafflow_ti.synthetic.write import write_scene
 
 SCENE = PlaneScene(
     f_px=900.0,
@@ -129,10 +138,103 @@ def test_resumed_run_ends_with_the_same_bytes(capture: Capture, tmp_path: Path, 
 
     with pytest.raises(KeyboardInterrupt):
         lf.run(capture, tmp_path / "out.zarr", wanted, progress=die)
-    assert len(lf.ResultStore.open(tmp_path / "out.zarr").done()) == stop_after
+    store = lf.ResultStore.open(tmp_path / "out.zarr")
+    assert len(store.done()) == stop_after
+    first = Timings.of(store.attrs["timings"])
+    assert (first.units, first.runs) == (stop_after, 1)
     lf.run(capture, tmp_path / "out.zarr", wanted, resume=True)
     lf.run(capture, tmp_path / "whole.zarr", wanted)
     assert files_of(tmp_path / "out.zarr") == files_of(tmp_path / "whole.zarr")
+    both, alone = (Timings.of(lf.ResultStore.open(tmp_path / n).attrs["timings"]) for n in ("out.zarr", "whole.zarr"))
+    assert (both.units, both.frames, both.pixels, both.runs) == (9, 3, 3 * 43 * 61, 2)
+    assert (alone.units, alone.frames, alone.pixels, alone.runs) == (9, 3, 3 * 43 * 61, 1)
+    assert both.device == alone.device
+    assert set(both.stages) == set(alone.stages) >= {"compile", "decode", "filter", "tensor", "solve", "fit", "write"}
+    assert both.seconds > first.seconds
+    assert all(both.stages[stage] >= seconds > 0 for stage, seconds in first.stages.items())
+
+
+@pytest.fixture(scope="module")
+def on_disk(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A folder of compressed images, and what they hold: floats, some of them not finite."""
+    folder = tmp_path_factory.mktemp("disk") / "capture"
+    write_scene(replace(SCENE, bits=None), folder)
+    images = render(SCENE).astype(np.float32)
+    images[6, 0, 1, 20:22, 30] = np.nan
+    for t, sx in np.ndindex(images.shape[0], images.shape[2]):
+        path = folder / f"cam_{sx:02d}" / f"frame_{t:03d}.tif"
+        tifffile.imwrite(path, images[t, 0, sx], compression="zlib", rowsperstrip=8)
+    return folder, images
+
+
+@pytest.mark.parametrize("more", [{}, {"prefilter": "highpass", "sigma_pre": 2.0}])
+def test_reading_ahead_changes_nothing(
+    on_disk: tuple[Path, np.ndarray], tmp_path: Path, more: dict[str, object]
+) -> None:
+    folder, images = on_disk
+    in_memory = capture_from_array(images, Geometry(SCENE.f_px, SCENE.principal, SCENE.baseline_mm))
+    files = lf.open_capture(folder)
+    wanted = config(tile=16, frames="4:7", **more)
+    assert [lf.plan_run(c, wanted).read_ahead for c in (files, in_memory)] == [2, 0]
+    threads = set(threading.enumerate())
+    for name, source in (("files.zarr", files), ("memory.zarr", in_memory)):
+        lf.run(source, tmp_path / name, wanted)
+    assert set(threading.enumerate()) <= threads
+    assert files_of(tmp_path / "files.zarr") == files_of(tmp_path / "memory.zarr")
+    assert (lf.ResultStore.open(tmp_path / "files.zarr").read("status") == Status.NOT_FINITE).any()
+
+
+def test_unreadable_image_ends_the_run_where_it_is_needed(on_disk: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    """Frame 10 is the last one that the third unit of a band needs."""
+    folder = tmp_path / "capture"
+    shutil.copytree(on_disk[0], folder)
+    damaged = folder / "cam_02" / "frame_010.tif"
+    data = bytearray(damaged.read_bytes())
+    with tifffile.TiffFile(damaged) as tif:
+        page = tif.pages[0]
+        assert isinstance(page, tifffile.TiffPage)
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            data[offset : offset + count] = bytes(count)
+    damaged.write_bytes(data)
+    threads = set(threading.enumerate())
+    with pytest.raises(InputError, match=r"cam_02.frame_010\.tif: page 0 cannot be decoded"):
+        lf.run(lf.open_capture(folder), tmp_path / "out.zarr", config(tile=16))
+    assert set(threading.enumerate()) <= threads
+    done = lf.ResultStore.open(tmp_path / "out.zarr").done()
+    assert done <= {0, 3}  # frames 4 and 5 of the first band; what waits to be written when it happens is dropped
+
+
+def test_little_memory_means_less_reading_ahead(on_disk: tuple[Path, np.ndarray]) -> None:
+    files = lf.open_capture(on_disk[0])
+
+    def planned(**limit: object) -> Plan:
+        large = {"model": "affine-scene-flow", "window": 31, "prefilter": "highpass", "sigma_pre": 40, "tile": 43}
+        return lf.plan_run(files, config(**large, **limit))
+
+    plenty = planned()
+    scarce = planned(max_memory=int(plenty.bytes / 0.8) - 1000)
+    assert (plenty.read_ahead, scarce.read_ahead) == (2, 1)
+    # 5 cameras, 4 bytes and one that says whether the value is finite; around 61 x 43 pixels one more on each side for
+    # the growth, half a window, half a filter of 5 taps twice, and four sigmas of the prefilter.
+    reach = 2 * (1 + 15 + 2 + 2 + 160)
+    assert plenty.bytes - scarce.bytes == 5 * 5 * (61 + reach) * (43 + reach)
+
+
+def test_decoded_images_are_kept_where_bands_share_them(tmp_path: Path) -> None:
+    """One strip an image: whole images are decoded."""
+    write_scene(replace(SCENE, bits=8), tmp_path / "capture")
+    for path in (tmp_path / "capture").rglob("*.tif"):
+        tifffile.imwrite(path, tifffile.imread(path), compression="zlib")
+    files = lf.open_capture(tmp_path / "capture")
+    every = 13 * 5 * 43 * 61
+    several, one = (lf.plan_run(files, config(tile=tile)) for tile in (16, 43))
+    assert (several.bands, several.cache_bytes) == (3, every)
+    assert (one.bands, one.cache_bytes) == (1, 0)
+    assert several.bytes > every
+    lf.run(files, tmp_path / "one.zarr", config(tile=43, frames="4:5"))
+    assert files._cache.used == 0
+    lf.run(files, tmp_path / "several.zarr", config(tile=16, frames="4:5"))
+    assert files._cache.used == 9 * 5 * 43 * 61  # the frames that this run needs
 
 
 RUN_WITH_THREADS = """
@@ -183,11 +285,38 @@ def test_plan_counts_every_output_plane() -> None:
     assert Output.PLANES == OUTPUT_PLANES
 
 
-def test_front_end_of_the_engine_is_left_as_it_was() -> None:
-    from leafflow_ti.kernels.engine import ENGINE, quick_front_end
+def test_the_engine_is_left_as_it_was() -> None:
+    from leafflow_ti.kernels.engine import ENGINE, LaneKernel, quick_front_end, ti
 
-    front_end = importlib.import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
-    usual = front_end.TextWrapper
+    kernels = importlib.import_module(f"{ENGINE}.lang.kernel_impl")
+    contexts = importlib.import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
+
+    def settings() -> tuple[object, ...]:
+        return kernels.getsourcelines, kernels.textwrap, contexts.ASTTransformerContext.get_pos_info
+
+    usual = settings()
     with quick_front_end():
-        assert front_end.TextWrapper is not usual
-    assert front_end.TextWrapper is usual
+        assert not any(one is other for one, other in zip(settings(), usual, strict=True))
+    assert settings() == usual
+    with pytest.raises(RuntimeError, match="stop"), quick_front_end():
+        raise RuntimeError("stop")
+    assert settings() == usual
+
+    start()
+    config = ti.lang.impl.current_cfg()
+    split = config.real_matrix_scalarize
+    whole = LaneKernel.__new__(LaneKernel)
+    whole._kernel = lambda: config.real_matrix_scalarize
+    assert whole() is False
+    assert config.real_matrix_scalarize == split
+
+
+@pytest.mark.parametrize("model", ["affine-4d", "affine-scene-flow"])
+def test_steps_launched_apart_give_the_same_bits(bench: Callable, model: str) -> None:
+    b = bench(model, "none", "line-x", "f32")
+    motion = MODELS[model].motions[0]
+    apart, together = (b.estimate(motion, apart=apart) for apart in (True, False))
+    np.testing.assert_array_equal(together.status, apart.status)
+    for name in ("disparity", "depth", "slope_x", "slope_y", "flow_x", "flow_y", *(f"velocity_{a}" for a in "xyz")):
+        for one, other in zip(together.map(name), apart.map(name), strict=True):
+            np.testing.assert_array_equal(one, other)

@@ -109,6 +109,40 @@ def test_zarr_walks_it_without_a_warning(full: ResultStore) -> None:
     assert status.nchunks_initialized == full.n_units
 
 
+def test_chunks_are_those_that_zarr_itself_writes(full: ResultStore, tmp_path: Path) -> None:
+    """The last band is lower than a chunk, and a chunk of fill values has no file."""
+    again = make(tmp_path / "again.zarr")
+    for store in (full, again):
+        empty = np.full((4, X.size), np.nan, np.float32)
+        status = np.full(empty.shape, Status.NOT_COMPUTED, np.uint8)
+        store.write_unit(1, 0, slice(4, 8), dict.fromkeys(NAMES, empty), status)
+    group = zarr.open_group(again.path, mode="r+")
+    for name in (*NAMES, "status"):
+        array = group[name]
+        assert isinstance(array, zarr.Array)
+        array[:] = full.read(name)
+    written, expected = files(full.path), files(again.path)
+    assert {n: b for n, b in written.items() if "/c/" in n} == {n: b for n, b in expected.items() if "/c/" in n}
+    assert not any(name.startswith("depth/c/0/1/") for name in written)
+
+
+def test_a_store_packed_otherwise_is_not_written(tmp_path: Path) -> None:
+    store = make(tmp_path / "out.zarr")
+    zarr.create_array(
+        store.path / "depth", shape=(2, 10, X.size), chunks=(1, 4, X.size), dtype="f4", compressors=None, overwrite=True
+    )
+    with pytest.raises(RunError, match="depth is stored in a way that this program does not write: use --overwrite"):
+        write(ResultStore.open(store.path), 0)
+
+
+def test_attributes_change_as_a_whole(full: ResultStore) -> None:
+    before = full.attrs
+    full.update_attrs({"timings": {"seconds": 1.5}})
+    assert full.attrs == ResultStore.open(full.path).attrs == {**before, "timings": {"seconds": 1.5}}
+    assert dict(zarr.open_group(full.path, mode="r").attrs) == full.attrs
+    assert sorted(p.name for p in (full.path / "status" / ".done").iterdir()) == [str(n) for n in range(6)]
+
+
 def test_two_runs_and_a_resumed_one_give_equal_bytes(full: ResultStore, tmp_path: Path) -> None:
     again = make(tmp_path / "again.zarr")
     write(again, 5)

@@ -1,6 +1,7 @@
 """Captures: image files on disk (or arrays) as lazy windows ``[t, sy, sx, y, x]`` with their geometry."""
 
 from leafflow_ti.capture.capture import (
+    DEFAULT_CACHE_BYTES,
     ArrayCapture,
     Capture,
     FileCapture,
@@ -14,6 +15,7 @@ from leafflow_ti.capture.images import probe, read_gray
 from leafflow_ti.capture.preshift import find_preshift
 
 __all__ = [
+    "DEFAULT_CACHE_BYTES",
     "ArrayCapture",
     "Camera",
     "Capture",

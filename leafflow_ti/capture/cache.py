@@ -10,7 +10,11 @@ from leafflow_ti.capture.channels import Array
 
 
 class ImageCache:
-    """Arrays by key, together at most ``limit`` bytes; a larger array is handed out but not kept."""
+    """Arrays by key, together at most ``limit`` bytes; a larger array is handed out but not kept.
+
+    Made for images that are asked for in the same order again and again: those that do not all fit are not worth
+    keeping, since each would be forgotten just before it is needed. Who knows that sets the limit to 0.
+    """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
@@ -46,6 +50,15 @@ class ImageCache:
             return
         self._images[key] = image
         self.used += image.nbytes
+        self._forget()
+
+    def _forget(self) -> None:
         while self.used > self.limit:
             _, old = self._images.popitem(last=False)
             self.used -= old.nbytes
+
+    def set_limit(self, limit: int) -> None:
+        """Keep at most ``limit`` bytes from now on."""
+        with self._lock:
+            self.limit = limit
+            self._forget()

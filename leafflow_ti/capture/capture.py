@@ -9,9 +9,11 @@ the files.
 from __future__ import annotations
 
 import hashlib
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +85,14 @@ class Capture(ABC):
         """What to call one image in a message."""
         return f"frame {t}, camera row {sy}, column {sx}"
 
+    @property
+    def cacheable_bytes(self) -> int:
+        """Memory that spares decoding an image for each of its windows, if all images are kept; 0: none does."""
+        return 0
+
+    def keep_decoded(self, n_bytes: int) -> None:  # noqa: B027 - most captures keep nothing
+        """Keep decoded images of at most so many bytes from now on."""
+
     @abstractmethod
     def fingerprint(self) -> dict[str, Any]:
         """What identifies the input in a result's provenance."""
@@ -116,13 +126,30 @@ class Capture(ABC):
         image pixel ``(x' + nx kx, y' + ny ky)``: the integer preshift nu0 of model section 1. Outside the images: 0.
         """
         out = np.zeros((len(frames), len(rows), len(cols), y1 - y0, x1 - x0), dtype)
+        for fill in self.fills(out, frames, rows, cols, y0, x0, shift_px):
+            fill()
+        return out
+
+    def fills(
+        self,
+        out: Array,
+        frames: Sequence[int],
+        rows: Sequence[int],
+        cols: Sequence[int],
+        y0: int,
+        x0: int,
+        shift_px: tuple[int, int] = (0, 0),
+    ) -> Iterator[Callable[[], None]]:
+        """The work of ``block``, image by image, for threads to share: each call fills its image of ``out``.
+
+        ``out`` [t, sy, sx, rows, columns] is zero before; the order is that of its images.
+        """
         row0, col0 = self.reference
         for i, t in enumerate(frames):
             for j, sy in enumerate(rows):
                 for k, sx in enumerate(cols):
                     top, left = y0 + shift_px[1] * (sy - row0), x0 + shift_px[0] * (sx - col0)
-                    self._read_into(out[i, j, k], t, sy, sx, top, left)
-        return out
+                    yield partial(self._read_into, out[i, j, k], t, sy, sx, top, left)
 
     def _read_into(self, out: Array, t: int, sy: int, sx: int, top: int, left: int) -> None:
         """Copy the part of a window that lies inside the image; ``out`` is zero before."""
@@ -148,6 +175,18 @@ class FileCapture(Capture):
         if self.layout.info.windowed:
             return self._checked(path, read_window(path, page, self.channel, y0, y1, x0, x1))
         return self._cache.get((path, page), lambda: self._decode(path, page))[y0:y1, x0:x1]
+
+    @property
+    def cacheable_bytes(self) -> int:
+        """See ``Capture``; a mixture of colours is kept as float."""
+        if self.layout.info.windowed:
+            return 0
+        itemsize = self.dtype.itemsize if self.layout.info.colour == "gray" else max(4, self.dtype.itemsize)
+        return math.prod(self.shape) * itemsize
+
+    def keep_decoded(self, n_bytes: int) -> None:
+        """See ``Capture``."""
+        self._cache.set_limit(n_bytes)
 
     def image_name(self, t: int, sy: int, sx: int) -> str:
         """The file, and the page where it holds several."""

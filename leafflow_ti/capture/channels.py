@@ -43,7 +43,7 @@ class ImageInfo:
     colour: Colour
     """``bands``: several samples that the file does not name; they need an explicit channel index."""
     windowed: bool
-    """A window costs only its own bytes or tiles; otherwise the whole page is decoded."""
+    """A window costs only its own bytes, strips or tiles; otherwise the whole page is decoded."""
     pages: int = 1
     page_shape: tuple[int, ...] = (1,)
     """Sizes of the stack's axes where the file states them (ImageJ, tifffile), else ``(pages,)``."""

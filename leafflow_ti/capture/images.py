@@ -7,6 +7,7 @@ must stay exact.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +57,7 @@ def page_info(path: Path, page: int) -> ImageInfo:
 def read_window(path: Path, page: int, channel: Channel, y0: int, y1: int, x0: int, x1: int) -> Array:
     """Grey window ``[y1-y0, x1-x0]`` inside the page, as stored (a mixture of colours as float).
 
-    Only the needed bytes or tiles are read where ``ImageInfo.windowed`` says so. Raises like ``read_gray``.
+    Only the needed bytes, strips or tiles are read where ``ImageInfo.windowed`` says so. Raises like ``read_gray``.
     """
     info = page_info(path, page)
     if not (0 <= y0 < y1 <= info.height and 0 <= x0 < x1 <= info.width):
@@ -75,10 +76,17 @@ def read_window(path: Path, page: int, channel: Channel, y0: int, y1: int, x0: i
 
 def _format(path: Path) -> str:
     try:
-        with path.open("rb") as file:
-            head = file.read(8)
+        stat = path.stat()
+        return _format_of(path, stat.st_size, stat.st_mtime_ns)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}): check the path and its permissions") from error
+
+
+@lru_cache(maxsize=4096)
+def _format_of(path: Path, _size: int, _mtime_ns: int) -> str:
+    """Format by the first bytes, remembered until size or time of the file change."""
+    with path.open("rb") as file:
+        head = file.read(8)
     if head[:4] in _TIFF_MAGIC:
         return "tiff"
     if head == simple_formats.PNG_MAGIC:

@@ -16,6 +16,7 @@ import numpy as np
 
 from leafflow_ti.capture.channels import Array, Colour, ImageInfo, check_size
 from leafflow_ti.errors import InputError, MissingExtra
+from leafflow_ti.trace import span
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_COLOURS: dict[int, tuple[Colour, int]] = {
@@ -52,7 +53,9 @@ def read_png(path: Path, info: ImageInfo, samples: tuple[int, ...]) -> Array:
     except ImportError as error:
         raise MissingExtra("imagecodecs", "codecs", f"reading {path}") from error
     try:
-        image: Array = np.asarray(imagecodecs.png_decode(path.read_bytes()))
+        with span("read"):
+            stored = path.read_bytes()
+        image: Array = np.asarray(imagecodecs.png_decode(stored))
     except Exception as error:
         raise InputError(f"{path}: damaged PNG ({' '.join(str(error).split())}): copy or write it again") from error
     image = image.reshape(info.height, info.width, -1)[..., list(samples)]
@@ -105,7 +108,9 @@ def read_pnm(path: Path, y0: int, y1: int, x0: int, x1: int, samples: tuple[int,
     header = _header_of(path)
     shape = (header.info.height, header.info.width, header.info.samples)
     if header.plain:
-        words = path.read_bytes()[header.offset :].split()
+        with span("read"):
+            stored = path.read_bytes()
+        words = stored[header.offset :].split()
         if len(words) != np.prod(shape):
             raise InputError(f"{path}: {len(words)} PNM values, {np.prod(shape)} expected: truncated, write it again")
         try:
@@ -115,7 +120,8 @@ def read_pnm(path: Path, y0: int, y1: int, x0: int, x1: int, samples: tuple[int,
         whole: Array = values.reshape(shape)
     else:
         whole = np.memmap(path, header.info.dtype.newbyteorder(">"), "r", header.offset, shape)
-    window = np.asarray(whole[y0:y1, x0:x1, list(samples)])
+    with span("read"):  # mapped: here the bytes are touched
+        window = np.asarray(whole[y0:y1, x0:x1, list(samples)])
     if window.min() < 0 or window.max() > header.maximum:
         raise InputError(f"{path}: PNM values above the stated maximum {header.maximum}: damaged, write it again")
     return window.astype(header.info.dtype)

@@ -10,6 +10,7 @@ import numpy as np
 from leafflow_ti.capture.channels import Array
 from leafflow_ti.capture.tiff_header import TiffImage, one_line, page_at, quiet, segment_grid
 from leafflow_ti.errors import InputError, LeafflowError, MissingExtra
+from leafflow_ti.trace import span
 
 
 def read(path: Path, page: int, y0: int, y1: int, x0: int, x1: int, samples: tuple[int, ...]) -> Array:
@@ -50,7 +51,8 @@ def _plain_window(
     shape = (n, height, width) if page.separate else (height, width, n)
     mapped = np.memmap(path, dtype, "r", page.offsets[0], shape)
     whole = np.moveaxis(mapped, 0, -1) if page.separate else mapped
-    return np.array(whole[y0:y1, x0:x1, list(samples)], dtype.newbyteorder("="))
+    with span("read"):
+        return np.array(whole[y0:y1, x0:x1, list(samples)], dtype.newbyteorder("="))
 
 
 def _decoded_window(file: BinaryIO, page: TiffImage, box: tuple[int, int, int, int], samples: tuple[int, ...]) -> Array:
@@ -64,8 +66,10 @@ def _decoded_window(file: BinaryIO, page: TiffImage, box: tuple[int, int, int, i
         for row in range(y0 // height, -(-y1 // height)):
             for column in range(x0 // width, -(-x1 // width)):
                 index = plane * rows * columns + row * columns + column
-                file.seek(page.offsets[index])
-                decoded, _, _ = page.decode(file.read(page.counts[index]), index, jpegtables=page.jpegtables)
+                with span("read"):
+                    file.seek(page.offsets[index])
+                    stored = file.read(page.counts[index])
+                decoded, _, _ = page.decode(stored, index, jpegtables=page.jpegtables)
                 if decoded is None:
                     raise ValueError(f"strip or tile {index} is empty")
                 tile = decoded[0]

@@ -31,6 +31,8 @@ _JPEG = 7
 _REFUSED_COLOURS = {4: "a mask", 5: "CMYK", 6: "YCbCr without JPEG", 8: "CIELab", 32803: "a raw colour mosaic"}
 _ALPHA = (1, 2)  # associated, unassociated
 _SEPARATE = 2
+STRIPS = 4
+"""Compressed strips in an image from which on a window decodes those that it touches, not all of them."""
 
 _reading = threading.local()
 
@@ -190,7 +192,7 @@ def _page(path: Path, page: tifffile.TiffPage, size: int) -> TiffImage:
             bits=8 if palette is not None else int(page.bitspersample),
             samples=visible,
             colour=colour,
-            windowed=(plain or page.is_tiled) and orientation == 1,
+            windowed=(plain or page.is_tiled or STRIPS * segment[0] <= height) and orientation == 1,
         ),
         offsets=tuple(page.dataoffsets),
         counts=tuple(page.databytecounts),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from leafflow_ti.cli.progress import format_rate
 from leafflow_ti.cli.run import format_status
 from leafflow_ti.errors import InputError
 
@@ -187,6 +188,7 @@ def _store_lines(facts: dict[str, Any]) -> list[str]:
         f"maps         {facts['rows']} x {facts['columns']} (y, x), "
         f"pixels x {_range(facts['x_px'])}, y {_range(facts['y_px'])}",
         f"units        {done} of {units} done" + ("" if done == units else ": go on with run --resume"),
+        *_timing_lines(facts["attributes"].get("timings")),
         "",
         f"status of the pixels of {'all frames' if len(facts['frames']) > 1 else 'the frame'}",
         *format_status(facts["status"]),
@@ -199,8 +201,22 @@ def _store_lines(facts: dict[str, Any]) -> list[str]:
         )
         lines.append(f"{name:<22} {row['units']:<12} {numbers}")
     for key, value in facts["attributes"].items():
-        lines += ["", key, *_indented(value)]
+        if key != "timings":
+            lines += ["", key, *_indented(value)]
     return lines
+
+
+def _timing_lines(timings: dict[str, Any] | None) -> list[str]:
+    """What the units have cost so far, on the clock and by stage."""
+    if not timings:
+        return []
+    runs = "one run" if timings["runs"] == 1 else f"{timings['runs']} runs"
+    stages = ", ".join(f"{stage} {seconds:.4g} s" for stage, seconds in timings["stages"].items())
+    return [
+        f"time         {timings['seconds']:.4g} s in {runs} on {timings['device']}: {timings['units']} units, "
+        f"{format_rate(timings['pixels_per_second'])}",
+        f"stages       {stages} (reading, decoding and writing go on beside the rest)",
+    ]
 
 
 def _indented(value: object) -> list[str]:

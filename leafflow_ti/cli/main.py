@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube)."),
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),
+    "profile": ("profile:profile", "Measure the stages of a run on this machine, and predict the whole."),
     "info": ("info:info", "Say what a capture, or a results store, is."),
 }
 """Command -> where it lives (module of this package:object) and its line in the help."""

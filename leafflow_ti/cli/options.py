@@ -6,6 +6,10 @@ whether it comes from an option, from ``--set`` or from a file. An option that i
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -77,3 +81,52 @@ Precision = Annotated[str | None, _text("precision", "f32|f64", "Floating-point 
 Arch = Annotated[str | None, _text("arch", "auto|cpu|cuda|vulkan|metal", "Device [auto].")]
 MaxMemory = Annotated[str | None, _text("max-memory", "SIZE", "Limit such as 8G [half of the machine's memory].")]
 Threads = Annotated[str | None, _text("threads", "auto|N", "CPU threads [auto].")]
+
+Config = Annotated[Path | None, _text("config", "run.toml", "Configuration file.")]
+Sets = Annotated[
+    list[str] | None, _text("set", "KEY=VALUE", "One value of the configuration, e.g. filters.taps=7.")
+]  # fmt: skip
+
+SETTINGS: dict[str, Any] = {
+    "preset": Preset, "model": Model, "motion": Motion, "deformation": Deformation, "rows": Rows,
+    "brightness": Brightness, "brightness_terms": BrightnessTerms, "constraint": Constraint, "beta": Beta,
+    "depth": Depth, "estimator": Estimator, "solver": Solver, "weighting": Weighting, "window": Window,
+    "sigma": Sigma, "stride": Stride, "border": Border, "taps": Taps, "prefilter": Prefilter,
+    "sigma_pre": SigmaPre, "frames": Frames, "roi": Roi, "mask": Mask, "preshift": Preshift,
+    "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads,
+}  # fmt: skip
+"""Keyword of the configuration -> its option."""
+
+
+def with_settings(without: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorator: gives a command ``--config``, ``--set`` and the options of ``SETTINGS``, but those in ``without``.
+
+    The command's parameter ``settings`` is a function that returns the checked configuration; its arguments are
+    further ``"a.b=v"``, over which options and ``--set`` win. It raises ConfigError.
+    """
+    kinds = {"config": Config, "sets": Sets} | {name: kind for name, kind in SETTINGS.items() if name not in without}
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def wrapper(**values: Any) -> None:
+            given = {name: values.pop(name) for name in kinds}
+            file, sets = given.pop("config"), given.pop("sets") or ()
+
+            def settings(*defaults: str) -> Any:
+                from leafflow_ti.config import load_config
+
+                return load_config(file, (*defaults, *sets), given)
+
+            command(**values, settings=settings)
+
+        # The command line is made from the signature.
+        own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name != "settings"]
+        added = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+                 for name, kind in kinds.items()]  # fmt: skip
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + added
+        del wrapper.__wrapped__
+        wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
+        return wrapper
+
+    return decorate

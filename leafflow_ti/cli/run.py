@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,52 +17,13 @@ if TYPE_CHECKING:
     from leafflow_ti.progress import RunSummary
 
 
+@options.with_settings()
 def run(
-    context: typer.Context,
+    settings: Callable[[], Any],
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="capture.toml, or the folder that holds it.")],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="OUT.zarr", help="Results store to write.", show_default=False)
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", metavar="run.toml", help="Configuration file.", show_default=False)
-    ] = None,
-    sets: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="One value of the configuration, e.g. filters.taps=7.",
-            show_default=False,
-        ),
-    ] = None,
-    preset: options.Preset = None,
-    model: options.Model = None,
-    motion: options.Motion = None,
-    deformation: options.Deformation = None,
-    rows: options.Rows = None,
-    brightness: options.Brightness = None,
-    brightness_terms: options.BrightnessTerms = None,
-    constraint: options.Constraint = None,
-    beta: options.Beta = None,
-    depth: options.Depth = None,
-    estimator: options.Estimator = None,
-    solver: options.Solver = None,
-    weighting: options.Weighting = None,
-    window: options.Window = None,
-    sigma: options.Sigma = None,
-    stride: options.Stride = None,
-    border: options.Border = None,
-    taps: options.Taps = None,
-    prefilter: options.Prefilter = None,
-    sigma_pre: options.SigmaPre = None,
-    frames: options.Frames = None,
-    roi: options.Roi = None,
-    mask: options.Mask = None,
-    preshift: options.Preshift = None,
-    precision: options.Precision = None,
-    arch: options.Arch = None,
-    max_memory: options.MaxMemory = None,
-    threads: options.Threads = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing results store.")] = False,
@@ -79,10 +41,7 @@ def run(
 
     Options win over --set, --set over --config. Results open with xarray.open_zarr(OUT.zarr, consolidated=False).
     """
-    from leafflow_ti.config import KEYWORDS, load_config
-
-    given = {key: value for key, value in context.params.items() if key in KEYWORDS}
-    settings = load_config(config, sets or (), given)
+    configuration = settings()
     if resume and overwrite:
         raise UsageError("--resume and --overwrite exclude each other: give the one that is meant")
     if out is None and not dry_run:
@@ -96,12 +55,12 @@ def run(
     from leafflow_ti import api
 
     if dry_run:
-        typer.echo(api.plan_run(opened, settings).describe())
+        typer.echo(api.plan_run(opened, configuration).describe())
         return
     assert out is not None
     show = None if quiet else ProgressLine()
     try:
-        summary = api.run(opened, out, settings, resume=resume, overwrite=overwrite, progress=show)
+        summary = api.run(opened, out, configuration, resume=resume, overwrite=overwrite, progress=show)
     except KeyboardInterrupt:
         typer.echo(f"interrupted: the same command with --resume goes on with {out}", err=True)
         raise

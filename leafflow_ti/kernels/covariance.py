@@ -10,262 +10,207 @@ from types import SimpleNamespace
 
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.texture import texture_function
-from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Region, Value, batch_kernel
+from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Region, Value
 
 
 @functools.cache
-def covariance_kernels(spec: KernelSpec) -> SimpleNamespace:
-    """The stages ``row_covariance`` and ``add_camera``, per solution, and ``geometry``."""
-    precise, lanes = spec.precise, spec.lanes
+def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
+    """The stages ``clean``, then ``row_covariance`` and ``add_camera`` per solution, and ``geometry``."""
+    precise, V = spec.precise, spec.element
     small, smoothness = dense(spec), texture_function(spec)
 
     @ti.func
-    def row_covariance(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+    def clean(
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
-        """Packed covariance of the rows of solution ``which``; keeps ``J_ff^-1 E``.
-
-        Most of the gradients' own noise is taken out of J_ff first: where there is nothing else, the variances must
-        grow instead of looking certain.
-        """
-        flow = number[Number.FLOW]
-        n_rows = number[Number.ROWS_S]
-        rows_at = Number.CAMERA_ROWS + which * MAX_ROWS
-        response_at = base + number[Region.RESPONSE_S] * stride
-        cov_at = base + number[Region.COV_S] * stride
-        if which == number[Number.MOTION_SOLUTION]:
-            n_rows = number[Number.ROWS_T]
-            rows_at = Number.MOTION_ROWS
-            response_at = base + number[Region.RESPONSE_T] * stride
-            cov_at = base + number[Region.COV_T] * stride
-        clean = base + number[Region.CLEAN] * stride
-        noise = base + number[Region.NOISE] * stride
-        product = base + number[Region.PRODUCT] * stride
-        variance = base + (number[Region.VARIANCE] + which) * stride
-        floor = base + number[Region.FLOOR] * stride
-        quietest = ti.Vector.zero(precise, lanes)
-        for j in range(number[Number.SOLUTIONS]):
-            at = base + (number[Region.VARIANCE] + j) * stride
-            for i in range(lanes):
-                quietest[i] = ti.select(j == 0, ws[at + i], ti.min(ws[at + i], quietest[i]))
-        for i in range(lanes):
-            ws[floor + i] = precise(0.0)
-        table = Value.RATIO + which * (flow * (flow + 1) // 2)
+        """Factor J_ff without most of the gradients' own noise: where there is nothing else, the variances must grow
+        instead of looking certain."""
+        flow = number[p.n + Number.FLOW]
+        moments, packed = region(p, number, Region.MOMENTS), region(p, number, Region.CLEAN)
+        variance = region(p, number, Region.VARIANCE)
+        quietest = ws[variance]
+        for j in range(1, number[p.n + Number.SOLUTIONS]):
+            quietest = ti.min(quietest, ws[variance + j * p.stride])
+        floor = V(0.0)
         for r in range(flow):
             for c in range(r + 1):
-                begin = number[Number.LOWER + tri(r, c)] * n_pixels + pixel
-                s = value[Value.SCALE + r] * value[Value.SCALE + c]
-                ratio = value[table + tri(r, c)]
-                element = ti.Vector.zero(precise, lanes)
-                scaled = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ti.cast(J[begin + i], precise) * s
-                for i in range(lanes):
-                    scaled[i] = element[i] * ratio
-                small.store(ws, noise + tri(r, c) * stride, scaled)
+                s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
+                element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride] * s
                 if r == c:
-                    own = value[Value.DENOISE] * value[Value.NOISE + r] * s
-                    for i in range(lanes):
-                        scaled[i] = ws[floor + i] + value[Value.RIDGE] * element[i]
-                    small.store(ws, floor, scaled)
-                    for i in range(lanes):
-                        element[i] -= own * quietest[i]
-                small.store(ws, clean + tri(r, c) * stride, element)
-        terms = number[Number.NOISE_TERMS]
-        extra = Value.RATIO + number[Number.SOLUTIONS] * (flow * (flow + 1) // 2) + which * terms
-        for term in range(terms):
-            at = Number.LOWER + tri(number[Number.N], 0) + 2 * term
-            begin = number[at + 1] * n_pixels + pixel
-            own = noise + number[at] * stride
-            for i in range(lanes):
-                ws[own + i] += value[extra + term] * ti.cast(J[begin + i], precise)
-        least = ti.Vector.zero(precise, lanes)
-        for i in range(lanes):
-            least[i] = ti.max(ws[floor + i] + precise(1e-3) * quietest[i], precise(1e-30))
-        small.store(ws, floor, least)
-        for r in range(flow):
-            for c in range(n_rows):
-                # p = s p~: the column of the inverse, in the parameter's own units.
-                unit = ti.select(number[rows_at + c] == r, value[Value.SCALE + r], precise(0.0))
-                at = response_at + (r * n_rows + c) * stride
-                for i in range(lanes):
-                    ws[at + i] = unit
-        if number[Number.OWN_FLOW] == 1:
+                    floor = floor + element * value[p.v + Value.RIDGE]
+                    element = element - quietest * (value[p.v + Value.DENOISE] * value[p.v + Value.NOISE + r] * s)
+                ws[packed + tri(r, c) * p.stride] = element
+        least = region(p, number, Region.FLOOR)
+        ws[least] = ti.max(floor + quietest * precise(1e-3), V(1e-30))
+        small.cholesky(ws, packed, flow, least, p.stride)
+
+    @ti.func
+    def response(
+        target: ti.i32, rows_at: ti.i32, n_rows: ti.i32, p: ti.template(), number: ti.template(),
+        value: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """``J_ff^-1 E`` at ``target`` [F, n_rows]: by what normal equations each row is made."""
+        flow = number[p.n + Number.FLOW]
+        small.clear(ws, target, flow * n_rows, p.stride)
+        for c in range(n_rows):
+            # p = s p~: the column of the inverse, in the parameter's own units.
+            r = number[p.n + rows_at + c]
+            ws[target + (r * n_rows + c) * p.stride] = V(value[p.v + Value.SCALE + r])
+        if number[p.n + Number.OWN_FLOW] == 1:
             # The flow itself is moved to another pixel by its derivatives there.
-            offsets = number[Number.OFFSETS]
+            nu, offsets = ws[region(p, number, Region.GEOMETRY)], number[p.n + Number.OFFSETS]
             for k in range(2):
-                step = value[Value.CAMERA_STEP + k]
+                step = value[p.v + Value.CAMERA_STEP + k]
+                shift = (nu * value[p.v + Value.BASELINE + k] - value[p.v + Value.SHIFT + k]) * step
                 for c in range(2):
-                    column = number[Number.MOVE + 2 * c + k]
-                    at = response_at + (column * n_rows + c * offsets) * stride
-                    for i in range(lanes):
-                        shift = step * (
-                            ws[base + number[Region.GEOMETRY] * stride + i] * value[Value.BASELINE + k]
-                            - value[Value.SHIFT + k]
-                        )
-                        ws[at + i] += value[Value.SCALE + column] * shift
-        for term in range(number[Number.CENTRE_TERMS]):
-            constant, square = number[Number.CENTRE + 2 * term], number[Number.CENTRE + 2 * term + 1]
-            share = value[Value.CENTRE + term] * value[Value.SCALE + square]
+                    column = number[p.n + Number.MOVE + 2 * c + k]
+                    at = target + (column * n_rows + c * offsets) * p.stride
+                    ws[at] = ws[at] + shift * value[p.v + Value.SCALE + column]
+        for term in range(number[p.n + Number.CENTRE_TERMS]):
+            constant, square = number[p.n + Number.CENTRE + 2 * term], number[p.n + Number.CENTRE + 2 * term + 1]
+            share = value[p.v + Value.CENTRE + term] * value[p.v + Value.SCALE + square]
             for c in range(n_rows):
-                if number[rows_at + c] == constant:
-                    at = response_at + (square * n_rows + c) * stride
-                    for i in range(lanes):
-                        ws[at + i] = share
-        small.cholesky(ws, clean, flow, floor, stride)
-        small.solve(ws, clean, response_at, flow, n_rows, stride)
-        small.symmetric_times(ws, noise, response_at, product, flow, n_rows, stride)
-        factor_of = smoothness(pixel, n_pixels, number, J)
-        for i in range(lanes):
-            factor_of[i] *= ws[variance + i]
+                if number[p.n + rows_at + c] == constant:
+                    ws[target + (square * n_rows + c) * p.stride] = V(share)
+        small.solve(ws, region(p, number, Region.CLEAN), target, flow, n_rows, p.stride)
+
+    @ti.func
+    def row_covariance(
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
+    ):  # fmt: skip
+        """Packed covariance of the rows of solution ``which``; keeps ``J_ff^-1 E``."""
+        flow = number[p.n + Number.FLOW]
+        n_rows, rows_at = number[p.n + Number.ROWS_S], Number.CAMERA_ROWS + p.which * MAX_ROWS
+        target, cov = region(p, number, Region.RESPONSE_S), region(p, number, Region.COV_S)
+        if p.which == number[p.n + Number.MOTION_SOLUTION]:
+            n_rows, rows_at = number[p.n + Number.ROWS_T], ti.cast(Number.MOTION_ROWS, ti.i32)
+            target, cov = region(p, number, Region.RESPONSE_T), region(p, number, Region.COV_T)
+        moments = region(p, number, Region.MOMENTS)
+        noise, product = region(p, number, Region.NOISE), region(p, number, Region.PRODUCT)
+        size = flow * (flow + 1) // 2
+        for r in range(flow):
+            for c in range(r + 1):
+                s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
+                ratio = value[p.v + Value.RATIO + p.which * size + tri(r, c)]
+                element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride]
+                ws[noise + tri(r, c) * p.stride] = element * (s * ratio)
+        terms = number[p.n + Number.NOISE_TERMS]
+        extra = Value.RATIO + number[p.n + Number.SOLUTIONS] * size + p.which * terms
+        for term in range(terms):
+            at = p.n + Number.LOWER + tri(number[p.n + Number.N], 0) + 2 * term
+            own = noise + number[at] * p.stride
+            ws[own] = ws[own] + ws[moments + number[at + 1] * p.stride] * value[p.v + extra + term]
+        response(target, rows_at, n_rows, p, number, value, ws)
+        small.symmetric_times(ws, noise, target, product, flow, n_rows, p.stride)
+        factor = smoothness(p, number, ws) * ws[region(p, number, Region.VARIANCE) + p.which * p.stride]
         for r in range(n_rows):
             for c in range(r + 1):
-                element = small.dot(ws, response_at + r * stride, n_rows, product + c * stride, n_rows, flow, stride)
-                for i in range(lanes):
-                    element[i] *= factor_of[i]
-                small.store(ws, cov_at + tri(r, c) * stride, element)
+                one, two = target + r * p.stride, product + c * p.stride
+                ws[cov + tri(r, c) * p.stride] = small.dot(ws, one, n_rows, two, n_rows, flow, p.stride) * factor
 
     @ti.func
-    def cross_covariance(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, camera: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
-    ):  # fmt: skip
-        """Covariance of the rows of one camera solution with those of the motion."""
-        rows_s, rows_t = number[Number.ROWS_S], number[Number.ROWS_T]
-        cross = base + number[Region.CROSS] * stride
-        one_at = base + number[Region.RESPONSE_S] * stride
-        two_at = base + number[Region.RESPONSE_T] * stride
-        factor_of = smoothness(pixel, n_pixels, number, J)
-        first = base + (number[Region.VARIANCE] + camera) * stride
-        second = base + (number[Region.VARIANCE] + number[Number.MOTION_SOLUTION]) * stride
-        for i in range(lanes):
-            factor_of[i] *= ti.sqrt(ti.max(ws[first + i] * ws[second + i], precise(0.0)))
-        for r in range(rows_s):
-            for c in range(rows_t):
-                element = ti.Vector.zero(precise, lanes)
-                for term in range(number[Number.CROSS_TERMS]):
-                    entry = Number.CROSS_AB + (camera * 9 + term) * 3
-                    a, b = number[entry], number[entry + 1]
-                    begin = number[entry + 2] * n_pixels + pixel
-                    s = value[Value.CROSS + camera * 9 + term] * value[Value.SCALE + a] * value[Value.SCALE + b]
-                    one = one_at + (a * rows_s + r) * stride
-                    two = two_at + (b * rows_t + c) * stride
-                    for i in range(lanes):
-                        element[i] += s * ti.cast(J[begin + i], precise) * ws[one + i] * ws[two + i]
-                for i in range(lanes):
-                    element[i] *= factor_of[i]
-                small.store(ws, cross + (r * rows_t + c) * stride, element)
+    def cross_covariance(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """Covariance of the rows of camera solution ``which`` with those of the motion."""
+        rows_s, rows_t = number[p.n + Number.ROWS_S], number[p.n + Number.ROWS_T]
+        cross, moments = region(p, number, Region.CROSS), region(p, number, Region.MOMENTS)
+        one_at, two_at = region(p, number, Region.RESPONSE_S), region(p, number, Region.RESPONSE_T)
+        variance = region(p, number, Region.VARIANCE)
+        common = ws[variance + p.which * p.stride] * ws[variance + number[p.n + Number.MOTION_SOLUTION] * p.stride]
+        factor = smoothness(p, number, ws) * ti.sqrt(ti.max(common, V(0.0)))
+        small.clear(ws, cross, rows_s * rows_t, p.stride)
+        for term in range(number[p.n + Number.CROSS_TERMS]):
+            entry = p.n + Number.CROSS_AB + (p.which * 9 + term) * 3
+            a, b = number[entry], number[entry + 1]
+            s = value[p.v + Value.CROSS + p.which * 9 + term]
+            s *= value[p.v + Value.SCALE + a] * value[p.v + Value.SCALE + b]
+            share = ws[moments + number[entry + 2] * p.stride] * factor * s
+            for r in range(rows_s):
+                weighted = ws[one_at + (a * rows_s + r) * p.stride] * share
+                for c in range(rows_t):
+                    at = cross + (r * rows_t + c) * p.stride
+                    ws[at] = ws[at] + weighted * ws[two_at + (b * rows_t + c) * p.stride]
 
     @ti.func
-    def accumulate(
-        base: ti.i32, stride: ti.i32, camera: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
-    ):
+    def accumulate(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Add one camera solution, whose cross disparity is known to be 0, to the normal equations of the geometry."""
-        terms, rows_t, flow = number[Number.TERMS], number[Number.ROWS_T], number[Number.FLOW]
-        cov = base + number[Region.COV_S] * stride
-        work = base + number[Region.GEOMETRY_WORK] * stride
-        axis = number[Number.CAMERA_AXIS + camera]
-        step = value[Value.BASELINE + axis]
+        terms, rows_t = number[p.n + Number.TERMS], number[p.n + Number.ROWS_T]
+        cov, work = region(p, number, Region.COV_S), region(p, number, Region.GEOMETRY_WORK)
+        axis = number[p.n + Number.CAMERA_AXIS + p.which]
+        step = value[p.v + Value.BASELINE + axis]
         n_used = 2 * terms
         for r in range(n_used):
             for c in range(terms):
-                unit = ti.select(r == c, step, precise(0.0))
-                at = work + (r * terms + c) * stride
-                for i in range(lanes):
-                    ws[at + i] = unit
-        if number[Number.WEIGHTED] == 1:
-            small.cholesky(ws, cov, n_used, -1, stride)
-            small.solve(ws, cov, work, n_used, terms, stride)
+                ws[work + (r * terms + c) * p.stride] = V(ti.select(r == c, step, precise(0.0)))
+        if number[p.n + Number.WEIGHTED] == 1:
+            small.cholesky(ws, cov, n_used, -1, p.stride)
+            small.solve(ws, cov, work, n_used, terms, p.stride)
         else:
-            spread = base + number[Region.GEOMETRY_SPREAD] * stride
-            for r in range(terms):
-                for c in range(r + 1):
-                    at = spread + tri(r, c) * stride
-                    own = cov + tri(r, c) * stride
-                    element = ti.Vector.zero(precise, lanes)
-                    for i in range(lanes):
-                        element[i] = ws[at + i] + step * step * ws[own + i]
-                    small.store(ws, at, element)
-        normal = base + number[Region.GEOMETRY_NORMAL] * stride
-        rhs = base + number[Region.GEOMETRY_RHS] * stride
+            spread = region(p, number, Region.GEOMETRY_SPREAD)
+            for e in range(tri(terms, 0)):
+                ws[spread + e * p.stride] = ws[spread + e * p.stride] + ws[cov + e * p.stride] * (step * step)
+        normal, rhs = region(p, number, Region.GEOMETRY_NORMAL), region(p, number, Region.GEOMETRY_RHS)
+        found = region(p, number, Region.PARAMETERS) + p.which * number[p.n + Number.FLOW] * p.stride
         for r in range(terms):
             for c in range(r + 1):
-                at = normal + tri(r, c) * stride
-                own = work + (r * terms + c) * stride
-                element = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ws[at + i] + step * ws[own + i]
-                small.store(ws, at, element)
-            element = ti.Vector.zero(precise, lanes)
-            at = rhs + r * stride
-            for i in range(lanes):
-                element[i] = ws[at + i]
+                at = normal + tri(r, c) * p.stride
+                ws[at] = ws[at] + ws[work + (r * terms + c) * p.stride] * step
+            total = ws[rhs + r * p.stride]
             for m in range(n_used):
-                row = number[Number.CAMERA_ROWS + camera * MAX_ROWS + m]
-                parameter = base + (number[Region.PARAMETERS] + camera * flow + row) * stride
-                weight = work + (m * terms + r) * stride
-                constant = ti.select(m == 0, value[Value.SHIFT + axis], precise(0.0))
-                for i in range(lanes):
-                    element[i] += ws[weight + i] * (ws[parameter + i] + constant)
-            small.store(ws, at, element)
-        if number[Number.MOTION_SOLUTION] >= 0:
-            cross = base + number[Region.CROSS] * stride
-            target = base + number[Region.GEOMETRY_CROSS] * stride
+                row = number[p.n + Number.CAMERA_ROWS + p.which * MAX_ROWS + m]
+                constant = ti.select(m == 0, value[p.v + Value.SHIFT + axis], precise(0.0))
+                total = total + ws[work + (m * terms + r) * p.stride] * (ws[found + row * p.stride] + constant)
+            ws[rhs + r * p.stride] = total
+        if number[p.n + Number.MOTION_SOLUTION] >= 0:
+            cross, target = region(p, number, Region.CROSS), region(p, number, Region.GEOMETRY_CROSS)
             for r in range(terms):
                 for c in range(rows_t):
-                    at = target + (r * rows_t + c) * stride
-                    element = small.dot(ws, work + r * stride, terms, cross + c * stride, rows_t, n_used, stride)
-                    for i in range(lanes):
-                        element[i] += ws[at + i]
-                    small.store(ws, at, element)
+                    at = target + (r * rows_t + c) * p.stride
+                    one, two = work + r * p.stride, cross + c * p.stride
+                    ws[at] = ws[at] + small.dot(ws, one, terms, two, rows_t, n_used, p.stride)
 
     @ti.func
     def add_camera(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
         """Add camera solution ``which`` to the normal equations of the geometry; the first one clears them."""
-        terms, rows_s, rows_t = number[Number.TERMS], number[Number.ROWS_S], number[Number.ROWS_T]
-        if which == 0:
-            for e in range(number[Region.GEOMETRY_COV] - number[Region.GEOMETRY_NORMAL]):
-                for i in range(lanes):
-                    ws[base + (number[Region.GEOMETRY_NORMAL] + e) * stride + i] = precise(0.0)
-            for e in range(terms * rows_t):
-                for i in range(lanes):
-                    ws[base + (number[Region.GEOMETRY_CROSS] + e) * stride + i] = precise(0.0)
-        if number[Number.MOTION_SOLUTION] >= 0:
-            cross_covariance(base, pixel, stride, n_pixels, which, number, value, J, ws)
+        terms, rows_s, rows_t = number[p.n + Number.TERMS], number[p.n + Number.ROWS_S], number[p.n + Number.ROWS_T]
+        if p.which == 0:
+            normal = region(p, number, Region.GEOMETRY_NORMAL)
+            sums = number[p.n + Region.GEOMETRY_COV] - number[p.n + Region.GEOMETRY_NORMAL]
+            small.clear(ws, normal, sums, p.stride)
+            small.clear(ws, region(p, number, Region.GEOMETRY_CROSS), terms * rows_t, p.stride)
+        if number[p.n + Number.MOTION_SOLUTION] >= 0:
+            cross_covariance(p, number, value, ws)
         if rows_s > 2 * terms:
             # The variance of the brightness row, which the next camera solution would overwrite.
-            small.copy(
-                ws, base + (number[Region.COV_S] + tri(rows_s - 1, rows_s - 1)) * stride,
-                base + (number[Region.BRIGHTNESS_VARIANCE] + which) * stride, 1, stride,
-            )  # fmt: skip
-        accumulate(base, stride, which, number, value, ws)
+            kept = region(p, number, Region.BRIGHTNESS_VARIANCE) + p.which * p.stride
+            ws[kept] = ws[region(p, number, Region.COV_S) + tri(rows_s - 1, rows_s - 1) * p.stride]
+        accumulate(p, number, value, ws)
 
     @ti.func
     def geometry(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
         """Least squares of (nu, b_x, b_y, b_t) per mm over all camera solutions: (3.40), with normals."""
-        terms = number[Number.TERMS]
-        normal = base + number[Region.GEOMETRY_NORMAL] * stride
-        result = base + number[Region.GEOMETRY] * stride
-        cross = base + number[Region.GEOMETRY_CROSS] * stride
-        cov = base + number[Region.GEOMETRY_COV] * stride
-        small.cholesky(ws, normal, terms, -1, stride)
-        small.copy(ws, base + number[Region.GEOMETRY_RHS] * stride, result, terms, stride)
+        terms, weighted = number[p.n + Number.TERMS], number[p.n + Number.WEIGHTED]
+        normal, result = region(p, number, Region.GEOMETRY_NORMAL), region(p, number, Region.GEOMETRY)
+        cross, cov = region(p, number, Region.GEOMETRY_CROSS), region(p, number, Region.GEOMETRY_COV)
+        small.cholesky(ws, normal, terms, -1, p.stride)
+        small.copy(ws, region(p, number, Region.GEOMETRY_RHS), result, terms, p.stride)
         for part in range(2):
             target = ti.select(part == 0, result, cross)
-            small.solve(ws, normal, target, terms, ti.select(part == 0, 1, number[Number.ROWS_T]), stride)
-        if number[Number.WEIGHTED] == 1:
-            small.set_identity(ws, cov, terms, stride)
+            small.solve(ws, normal, target, terms, ti.select(part == 0, 1, number[p.n + Number.ROWS_T]), p.stride)
+        if weighted == 1:
+            small.set_identity(ws, cov, terms, p.stride)
         else:
-            small.unpack(ws, base + number[Region.GEOMETRY_SPREAD] * stride, cov, terms, stride)
-        small.sandwich(ws, normal, cov, terms, 2 - number[Number.WEIGHTED], stride)
+            small.unpack(ws, region(p, number, Region.GEOMETRY_SPREAD), cov, terms, p.stride)
+        small.sandwich(ws, normal, cov, terms, 2 - weighted, p.stride)
 
-    return SimpleNamespace(**{f.__name__: batch_kernel(spec, f) for f in (row_covariance, add_camera, geometry)})
+    return SimpleNamespace(clean=clean, row_covariance=row_covariance, add_camera=add_camera, geometry=geometry)

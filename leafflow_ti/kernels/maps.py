@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 from leafflow_ti.kernels.dense import tri
 from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.patch import patch_functions
 from leafflow_ti.kernels.spec import KernelSpec
-from leafflow_ti.kernels.workspace import Number, Region, Value, batch_kernel
+from leafflow_ti.kernels.workspace import Number, Region, Value
 from leafflow_ti.status import Status
 
 
@@ -38,197 +39,218 @@ class Output(IntEnum):
 
 
 @functools.cache
-def maps_kernels(spec: KernelSpec) -> SimpleNamespace:
-    """The stages that write the output planes: ``measured``, all but the motion, and ``motion``."""
-    real, precise, lanes = spec.real, spec.precise, spec.lanes
+def maps_stages(spec: KernelSpec) -> SimpleNamespace:
+    """The stages ``measured`` (all maps but the motion), ``motion``, and ``emit``, which writes them to the planes."""
+    real, precise, lanes, V = spec.real, spec.precise, spec.lanes, spec.element
     patch = patch_functions(spec)
     ok, no_structure, aperture, incoherent = (
-        int(s) for s in (Status.OK, Status.NO_STRUCTURE, Status.APERTURE, Status.INCOHERENT)
+        float(s) for s in (Status.OK, Status.NO_STRUCTURE, Status.APERTURE, Status.INCOHERENT)
     )
-    not_converged, border = int(Status.NOT_CONVERGED), int(Status.BORDER)
+    not_converged, border = float(Status.NOT_CONVERGED), float(Status.BORDER)
     nan = float("nan")
 
     @ti.func
-    def put(out: ti.template(), plane: ti.i32, pixel: ti.i32, n_pixels: ti.i32, value: precise, variance: precise):
-        out[plane * n_pixels + pixel] = ti.cast(value, real)
-        out[(Output.STD + plane) * n_pixels + pixel] = ti.cast(ti.sqrt(ti.max(variance, precise(0.0))), real)
-
-    @ti.func
-    def classify(
-        base: ti.i32, at: ti.i32, i: ti.i32, stride: ti.i32, n_pixels: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
-    ) -> ti.i32:  # fmt: skip
-        """The first of: border, no structure, incoherent, not converged, aperture, ok."""
-        ix, iy = number[Number.FLOW_ROWS], number[Number.FLOW_ROWS + 1]
-        xx = ti.cast(J[number[Number.LOWER + tri(ix, ix)] * n_pixels + at], precise)
-        xy = ti.cast(J[number[Number.LOWER + tri(iy, ix)] * n_pixels + at], precise)
-        yy = ti.cast(J[number[Number.LOWER + tri(iy, iy)] * n_pixels + at], precise)
-        mass = ti.cast(J[number[Number.EXTRA] * n_pixels + at], precise)
-        level = ti.cast(J[(number[Number.EXTRA] + 3) * n_pixels + at], precise)
-        gradient = ti.cast(J[(number[Number.EXTRA] + 1) * n_pixels + at], precise)
-        smooth = ti.cast(J[(number[Number.EXTRA] + 2) * n_pixels + at], precise)
-        noise = precise(0.0)
-        energy = precise(0.0)
-        lost = 0
-        for j in range(number[Number.SOLUTIONS]):
-            variance = ws[base + (number[Region.VARIANCE] + j) * stride + i]
-            noise += variance / ti.cast(number[Number.SOLUTIONS], precise)
-            energy += variance * value[Value.NOISE + number[Number.FLOW] + j]
-            shift = precise(0.0)
-            for column in range(2):
-                p = number[Region.PARAMETERS] + j * number[Number.FLOW] + number[Number.FLOW_ROWS + column]
-                shift += ws[base + p * stride + i] ** 2
-            if not shift < value[Value.MAX_SHIFT] ** 2:
-                lost = 1
-        gain = value[Value.GAIN]
-        half = (xx + yy) / 2
-        weakest = half - ti.sqrt(ti.max(half * half - (xx * yy - xy * xy), precise(0.0)))
-        result = ti.cast(ok, ti.i32)
-        if mass < value[Value.MIN_MASS]:
-            result = border
-        elif not half > value[Value.MIN_STRUCTURE] * level:
-            result = no_structure
-        elif not half > 2 * noise * gain:
-            # The constraint explains nothing: there is nothing but noise, or texture that does not move as one.
-            result = ti.select(smooth > value[Value.ROUGHEST] * gradient, incoherent, no_structure)
-        elif not (energy < value[Value.MAX_RESIDUAL] * value[Value.MAX_RESIDUAL] * 2 * half):
-            result = incoherent
-        elif ws[base + number[Region.CONVERGED] * stride + i] < 0.5:
-            result = not_converged
-        elif weakest < 2 * noise * gain or weakest < precise(1e-4) * half:
-            result = aperture
-        elif lost == 1:
-            result = incoherent
-        return result
-
-    @ti.func
-    def parameter(base: ti.i32, row: ti.i32, stride: ti.i32, number: ti.template()) -> ti.i32:
-        """Where the parameter of a motion row lies."""
-        column = number[Number.MOTION_SOLUTION] * number[Number.FLOW] + number[Number.MOTION_ROWS + row]
-        return base + (number[Region.PARAMETERS] + column) * stride
-
-    @ti.func
-    def world(
-        base: ti.i32, at: ti.i32, i: ti.i32, stride: ti.i32, n_pixels: ti.i32,
-        number: ti.template(), value: ti.template(), ws: ti.template(), out: ti.template(),
+    def put(
+        plane: ti.i32, result: ti.template(), variance: ti.template(), p: ti.template(), target: ti.i32,
+        ws: ti.template(),
     ):  # fmt: skip
+        """One map and its standard error."""
+        ws[target + plane * p.stride] = result
+        ws[target + (Output.STD + plane) * p.stride] = ti.sqrt(ti.max(variance, V(0.0)))
+
+    @ti.func
+    def classify(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """The first of: border, no structure, incoherent, not converged, aperture, ok."""
+        moments, found = region(p, number, Region.MOMENTS), region(p, number, Region.PARAMETERS)
+        ix, iy = number[p.n + Number.FLOW_ROWS], number[p.n + Number.FLOW_ROWS + 1]
+        xx = ws[moments + number[p.n + Number.LOWER + tri(ix, ix)] * p.stride]
+        xy = ws[moments + number[p.n + Number.LOWER + tri(iy, ix)] * p.stride]
+        yy = ws[moments + number[p.n + Number.LOWER + tri(iy, iy)] * p.stride]
+        extra = moments + number[p.n + Number.EXTRA] * p.stride
+        mass, gradient = ws[extra], ws[extra + p.stride]
+        smooth, level = ws[extra + 2 * p.stride], ws[extra + 3 * p.stride]
+        solutions = number[p.n + Number.SOLUTIONS]
+        noise, energy, farthest = V(0.0), V(0.0), V(0.0)
+        for j in range(solutions):
+            variance = ws[region(p, number, Region.VARIANCE) + j * p.stride]
+            noise = noise + variance * (1.0 / ti.cast(solutions, precise))
+            energy = energy + variance * value[p.v + Value.NOISE + number[p.n + Number.FLOW] + j]
+            shift = V(0.0)
+            for k in range(2):
+                column = j * number[p.n + Number.FLOW] + number[p.n + Number.FLOW_ROWS + k]
+                u = ws[found + column * p.stride]
+                shift = shift + u * u
+            limit = value[p.v + Value.MAX_SHIFT]
+            farthest = ti.select(shift < V(limit * limit), farthest, V(1.0))  # also where it is no number
+        floor = noise * (2.0 * value[p.v + Value.GAIN])
+        half = (xx + yy) * 0.5
+        weakest = half - ti.sqrt(ti.max(half * half - (xx * yy - xy * xy), V(0.0)))
+        # From the last reason to the first, which is the one that counts.
+        result = ti.select(farthest > V(0.5), V(incoherent), V(ok))
+        result = ti.select((weakest < floor) | (weakest < half * 1e-4), V(aperture), result)
+        unsolved = ws[region(p, number, Region.CONVERGED)] < V(0.5)
+        result = ti.select(unsolved, V(not_converged), result)
+        largest = value[p.v + Value.MAX_RESIDUAL]
+        result = ti.select(energy < half * (2.0 * largest * largest), result, V(incoherent))
+        # The constraint explains nothing: there is nothing but noise, or texture that does not move as one.
+        rough = smooth > gradient * value[p.v + Value.ROUGHEST]
+        nothing = ti.select(rough, V(incoherent), V(no_structure))
+        result = ti.select(half > floor, result, nothing)
+        result = ti.select(half > level * value[p.v + Value.MIN_STRUCTURE], result, V(no_structure))
+        return ti.select(mass < V(value[p.v + Value.MIN_MASS]), V(border), result)
+
+    @ti.func
+    def geometry_maps(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """Disparity, depth and slopes."""
+        target, f, terms = region(p, number, Region.OUT), value[p.v + Value.F], number[p.n + Number.TERMS]
+        g, cov = region(p, number, Region.GEOMETRY), region(p, number, Region.GEOMETRY_COV)
+        nu, spread = ws[g], ws[cov]
+        step = value[p.v + Value.BASELINE + number[p.n + Number.CAMERA_AXIS]]
+        put(Output.DISPARITY, nu * step, spread * (step * step), p, target, ws)
+        Z0 = (0.0 - f) / nu
+        ratio = Z0 / nu
+        put(Output.DEPTH, Z0, spread * ratio * ratio, p, target, ws)
+        if terms > 1:
+            x, y = patch.pixel_ray(p, number, value)
+            c = 1.0 / (1.0 + Z0 * (ws[g + p.stride] * x + ws[g + 2 * p.stride] * y))
+            for k in range(2):
+                # slope = c b Z0, and c depends on both: gradient by (nu, b_k, the other b).
+                ray, other = x, y
+                if k == 1:
+                    ray, other = y, x
+                own = Z0 * ws[g + (1 + k) * p.stride]
+                beside = Z0 * ws[g + (2 - k) * p.stride]
+                by_nu = c * own / nu * (c * (own * ray + beside * other) - 1.0)
+                by_own = c * Z0 * (1.0 - c * own * ray)
+                by_other = 0.0 - c * c * own * Z0 * other
+                first, second = cov + (1 + k) * p.stride, cov + (2 - k) * p.stride
+                variance = by_nu * by_nu * spread
+                variance = variance + 2.0 * by_nu * (by_own * ws[first] + by_other * ws[second])
+                variance = variance + by_own * by_own * ws[first + (1 + k) * terms * p.stride]
+                variance = variance + by_other * by_other * ws[second + (2 - k) * terms * p.stride]
+                variance = variance + 2.0 * by_own * by_other * ws[first + (2 - k) * terms * p.stride]
+                put(Output.SLOPE_X + k, c * own, variance, p, target, ws)
+
+    @ti.func
+    def parameter(row: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
+        """Where the parameter of a motion row lies."""
+        column = number[p.n + Number.MOTION_SOLUTION] * number[p.n + Number.FLOW]
+        column += number[p.n + Number.MOTION_ROWS + row]
+        return region(p, number, Region.PARAMETERS) + column * p.stride
+
+    @ti.func
+    def world(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Brightness changes of the material (4.28): slopes along X and Y, and the trend without what moves past.
 
         All are linear in the image's slopes and trend; the weights' own errors, of geometry and motion, are left out.
         The motion is the one that the reference model's rows give.
         """
-        g = base + number[Region.GEOMETRY] * stride + i
-        q = base + number[Region.MOTION] * stride + i
-        rows = base + number[Region.COV_T] * stride + i
-        ray = patch.pixel_ray(at, number, value)
-        s = patch.surface(ray, value[Value.F], ws[g], ws[g + stride], ws[g + 2 * stride])
+        n, weight = number[p.n + Number.WORLD_MAPS], region(p, number, Region.MOTION_WORK)
+        g, q = region(p, number, Region.GEOMETRY), region(p, number, Region.MOTION)
+        rows, f = region(p, number, Region.COV_T), value[p.v + Value.F]
+        x, y = patch.pixel_ray(p, number, value)
+        Z0 = (0.0 - f) / ws[g]
+        P = ws[g + p.stride] * Z0
+        Q = ws[g + 2 * p.stride] * Z0
+        c = 1.0 / (1.0 + P * x + Q * y)
+        ZX = c * P
+        ZY = c * Q
         # Inverse of [∂X/∂x ∂Y/∂x; ∂X/∂y ∂Y/∂y] (5.8): its determinant is (Z0 / f)² / c.
-        weight = ti.Matrix.zero(precise, 3, 3)
-        weight[0, 0], weight[0, 1] = 1 - s[1] * ray[0], -s[1] * ray[1]
-        weight[1, 0], weight[1, 1] = -s[2] * ray[0], 1 - s[2] * ray[1]
-        weight *= value[Value.F] / s[0]
-        if number[Number.WORLD_MAPS] == 3:
-            n = ti.Vector([ws[q], ws[q + stride], ws[q + 2 * stride]], dt=precise)
-            Zt = n[2] - s[1] * n[0] - s[2] * n[1]
-            for k in ti.static(range(2)):
-                past = Zt / s[3] * ray[k] - n[k]  # the surface point seen at the pixel, relative to the material
-                for m in ti.static(range(2)):
-                    weight[2, m] -= past * weight[k, m]
-            weight[2, 2] = 1
-        first = number[Number.MOTION_FLOW] + 1  # behind the row of I
-        for k in range(number[Number.WORLD_MAPS]):
-            result = precise(0.0)
-            variance = precise(0.0)
-            for r in range(number[Number.WORLD_MAPS]):
-                result -= weight[k, r] * ws[parameter(base, first + r, stride, number) + i]
-                for c in range(number[Number.WORLD_MAPS]):
-                    spread = ws[rows + tri(first + ti.max(r, c), first + ti.min(r, c)) * stride]
-                    variance += weight[k, r] * weight[k, c] * spread
-            put(out, Output.BRIGHTNESS_WORLD_X + k, at, n_pixels, result, variance)
+        scale = f / Z0
+        ws[weight] = scale * (1.0 - ZX * x)
+        ws[weight + p.stride] = 0.0 - scale * ZX * y
+        ws[weight + 3 * p.stride] = 0.0 - scale * ZY * x
+        ws[weight + 4 * p.stride] = scale * (1.0 - ZY * y)
+        ws[weight + 2 * p.stride] = V(0.0)
+        ws[weight + 5 * p.stride] = V(0.0)
+        if n == 3:
+            N0, N1 = ws[q], ws[q + p.stride]
+            Zt = ws[q + 2 * p.stride] - ZX * N0 - ZY * N1
+            # The surface point seen at the pixel, relative to the material.
+            past_x = Zt / c * x - N0
+            past_y = Zt / c * y - N1
+            for m in range(2):
+                moved = past_x * ws[weight + m * p.stride] + past_y * ws[weight + (3 + m) * p.stride]
+                ws[weight + (6 + m) * p.stride] = 0.0 - moved
+            ws[weight + 8 * p.stride] = V(1.0)
+        first = number[p.n + Number.MOTION_FLOW] + 1  # behind the row of I
+        for k in range(n):
+            result, variance = V(0.0), V(0.0)
+            for r in range(n):
+                one = ws[weight + (3 * k + r) * p.stride]
+                result = result - one * ws[parameter(first + r, p, number)]
+                for m in range(n):
+                    spread = ws[rows + tri(first + ti.max(r, m), first + ti.min(r, m)) * p.stride]
+                    variance = variance + one * ws[weight + (3 * k + m) * p.stride] * spread
+            put(Output.BRIGHTNESS_WORLD_X + k, result, variance, p, region(p, number, Region.OUT), ws)
 
     @ti.func
     def measured(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
-        """Write the planes of status, geometry, flow and brightness that the model has."""
-        flow, terms = number[Number.FLOW], number[Number.TERMS]
-        solution = number[Number.MOTION_SOLUTION]
-        f = value[Value.F]
-        for i in range(lanes):
-            at = pixel + i
-            out[Output.STATUS * n_pixels + at] = ti.cast(
-                classify(base, at, i, stride, n_pixels, number, value, J, ws), real
-            )
-            if terms > 0:
-                g = base + number[Region.GEOMETRY] * stride + i
-                cov = base + number[Region.GEOMETRY_COV] * stride + i
-                nu = ws[g]
-                step = value[Value.BASELINE + number[Number.CAMERA_AXIS]]
-                put(out, Output.DISPARITY, at, n_pixels, nu * step, ws[cov] * step * step)
-                Z0 = -f / nu
-                put(out, Output.DEPTH, at, n_pixels, Z0, ws[cov] * (Z0 / nu) * (Z0 / nu))
-                if terms > 1:
-                    ray = patch.pixel_ray(at, number, value)
-                    b = ti.Vector([ws[g + stride], ws[g + 2 * stride]], dt=precise)
-                    s = patch.surface(ray, f, nu, b[0], b[1])
-                    c = s[3]
-                    for k in ti.static(range(2)):
-                        # slope = c b Z0, and c depends on both: gradient by (nu, b_x, b_y).
-                        own = Z0 * b[k]
-                        gradient = ti.Vector.zero(precise, 3)
-                        gradient[0] = (
-                            c * (-own / nu) * (1 - c * own * ray[k]) + c * c * own * Z0 * b[1 - k] * ray[1 - k] / nu
-                        )
-                        gradient[1 + k] = c * Z0 * (1 - c * own * ray[k])
-                        gradient[2 - k] = -c * c * own * Z0 * ray[1 - k]
-                        variance = precise(0.0)
-                        for r in ti.static(range(3)):
-                            for m in ti.static(range(3)):
-                                variance += gradient[r] * ws[cov + (r * terms + m) * stride] * gradient[m]
-                        put(out, Output.SLOPE_X + k, at, n_pixels, s[1 + k], variance)
-            rows = base + number[Region.COV_T] * stride + i
-            if solution >= 0:
-                for k in range(2):
-                    row = k * number[Number.OFFSETS]
-                    p = base + (number[Region.PARAMETERS] + solution * flow + number[Number.FLOW_ROWS + k]) * stride + i
-                    put(out, Output.FLOW_X + k, at, n_pixels, ws[p], ws[rows + tri(row, row) * stride])
-            if number[Number.BRIGHTNESS_COLUMN] >= 0:
-                for j in range(number[Number.CAMERA_SOLUTIONS]):
-                    p = base + (number[Region.PARAMETERS] + j * flow + number[Number.BRIGHTNESS_COLUMN]) * stride + i
-                    variance = ws[base + (number[Region.BRIGHTNESS_VARIANCE] + j) * stride + i]
-                    put(out, Output.BRIGHTNESS_SX + number[Number.CAMERA_AXIS + j], at, n_pixels, -ws[p], variance)
-            for j in range(number[Number.BRIGHTNESS_ROWS]):
-                row = number[Number.MOTION_FLOW] + j
-                p = parameter(base, row, stride, number)
-                plane = Output.BRIGHTNESS_T + number[Number.BRIGHTNESS_PLANES + j]
-                put(out, plane, at, n_pixels, -ws[p + i], ws[rows + tri(row, row) * stride])
-            if number[Number.WORLD_MAPS] > 0:
-                world(base, at, i, stride, n_pixels, number, value, ws, out)
+        """The maps of status, geometry, flow and brightness that the model has."""
+        target, found = region(p, number, Region.OUT), region(p, number, Region.PARAMETERS)
+        flow, rows = number[p.n + Number.FLOW], region(p, number, Region.COV_T)
+        ws[target + Output.STATUS * p.stride] = classify(p, number, value, ws)
+        if number[p.n + Number.TERMS] > 0:
+            geometry_maps(p, number, value, ws)
+        if number[p.n + Number.MOTION_SOLUTION] >= 0:
+            for k in range(2):
+                row = k * number[p.n + Number.OFFSETS]
+                column = number[p.n + Number.MOTION_SOLUTION] * flow + number[p.n + Number.FLOW_ROWS + k]
+                variance = ws[rows + tri(row, row) * p.stride]
+                put(Output.FLOW_X + k, ws[found + column * p.stride], variance, p, target, ws)
+        if number[p.n + Number.BRIGHTNESS_COLUMN] >= 0:
+            for j in range(number[p.n + Number.CAMERA_SOLUTIONS]):
+                at = found + (j * flow + number[p.n + Number.BRIGHTNESS_COLUMN]) * p.stride
+                variance = ws[region(p, number, Region.BRIGHTNESS_VARIANCE) + j * p.stride]
+                plane = Output.BRIGHTNESS_SX + number[p.n + Number.CAMERA_AXIS + j]
+                put(plane, 0.0 - ws[at], variance, p, target, ws)
+        for j in range(number[p.n + Number.BRIGHTNESS_ROWS]):
+            row = number[p.n + Number.MOTION_FLOW] + j
+            plane = Output.BRIGHTNESS_T + number[p.n + Number.BRIGHTNESS_PLANES + j]
+            put(plane, 0.0 - ws[parameter(row, p, number)], ws[rows + tri(row, row) * p.stride], p, target, ws)
+        if number[p.n + Number.WORLD_MAPS] > 0:
+            world(p, number, value, ws)
 
     @ti.func
     def motion(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
-        """Write the planes of the motion."""
-        n = number[Number.UNKNOWNS]
-        for i in range(lanes):
-            for j in range(9):
-                place = number[Number.PLACE + j]
-                if place >= 0:
-                    q = base + (number[Region.MOTION] + j) * stride + i
-                    cov = base + (number[Region.MOTION_COV] + place * n + place) * stride + i
-                    # Where no row was left the equations are singular: no number rather than any.
-                    determined = ws[cov] > 0 and ws[cov] < precise(1e30)
-                    found = ti.select(determined, ws[q], precise(nan))
-                    put(out, Output.MOTION + j, pixel + i, n_pixels, found, ws[cov])
-            if n >= 3:
-                for axis in range(2):
-                    for r in range(3):
-                        for c in range(r + 1):
-                            cov = base + (number[Region.DIFFERENCE_COV] + (axis * n + r) * n + c) * stride + i
-                            plane = Output.DIFFERENCES + 6 * axis + tri(r, c)
-                            out[plane * n_pixels + pixel + i] = ti.cast(ws[cov], real)
+        """The maps of the motion."""
+        n, target = number[p.n + Number.UNKNOWNS], region(p, number, Region.OUT)
+        cov = region(p, number, Region.MOTION_COV)
+        for j in range(9):
+            place = number[p.n + Number.PLACE + j]
+            if place >= 0:
+                variance = ws[cov + place * (n + 1) * p.stride]
+                # Where no row was left the equations are singular: no number rather than any.
+                determined = (variance > V(0.0)) & (variance < V(1e30))
+                found = ti.select(determined, ws[region(p, number, Region.MOTION) + j * p.stride], V(nan))
+                put(Output.MOTION + j, found, variance, p, target, ws)
+        if n >= 3:
+            for axis in range(2):
+                for r in range(3):
+                    for c in range(r + 1):
+                        at = region(p, number, Region.DIFFERENCE_COV) + ((axis * n + r) * n + c) * p.stride
+                        ws[target + (Output.DIFFERENCES + 6 * axis + tri(r, c)) * p.stride] = ws[at]
 
-    return SimpleNamespace(measured=batch_kernel(spec, measured), motion=batch_kernel(spec, motion))
+    @ti.func
+    def emit(
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
+    ):  # fmt: skip
+        """Write all maps of the group to their planes; those that the model does not have hold anything."""
+        target = region(p, number, Region.OUT)
+        for plane in range(Output.PLANES):
+            element = ws[target + plane * p.stride]
+            at = plane * p.n_pixels + p.pixel
+            if ti.static(lanes == 1):
+                out[at] = ti.cast(element, real)
+            else:
+                for i in ti.static(range(lanes)):
+                    out[at + i] = ti.cast(element[i], real)
+
+    return SimpleNamespace(measured=measured, motion=motion, emit=emit)

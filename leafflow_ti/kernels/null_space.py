@@ -10,315 +10,287 @@ from types import SimpleNamespace
 
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
-from leafflow_ti.kernels.spec import KernelSpec
-from leafflow_ti.kernels.workspace import BLOCK, Number, Region, Value, batch_kernel
+from leafflow_ti.kernels.group import region
+from leafflow_ti.kernels.spec import EXTRA_PLANES, KernelSpec
+from leafflow_ti.kernels.workspace import Number, Region, Value
 
 JACOBI_SWEEPS = 16
 RITZ_SWEEPS = 8
-ROUNDS = 4
+ROUNDS = 6
 
 
 @functools.cache
-def null_space_kernels(spec: KernelSpec) -> SimpleNamespace:
-    """The stages ``load``, ``least_squares``, ``factorise``, ``accept``, ``inverse_iteration``, ``jacobi``,
+def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
+    """The stages ``load``, ``scale``, ``least_squares``, ``factorise``, ``accept``, ``inverse_iteration``, ``jacobi``,
     ``parameters``, ``residuals`` and ``centre``."""
-    precise, lanes = spec.precise, spec.lanes
+    precise, lanes, V = spec.precise, spec.lanes, spec.element
     small = dense(spec)
 
     @ti.func
     def load(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
-        """``A = S J S``, packed, with a ridge."""
-        n = number[Number.N]
-        packed = base + number[Region.TENSOR] * stride
-        trace = ti.Vector.zero(precise, lanes)
-        for r in range(n):
-            for c in range(r + 1):
-                begin = number[Number.LOWER + tri(r, c)] * n_pixels + pixel
-                s = value[Value.SCALE + r] * value[Value.SCALE + c]
-                element = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ti.cast(J[begin + i], precise) * s
-                small.store(ws, packed + tri(r, c) * stride, element)
-                if r == c:
-                    for i in range(lanes):
-                        trace[i] += element[i]
-        for r in range(n):
-            at = packed + tri(r, r) * stride
-            element = ti.Vector.zero(precise, lanes)
-            for i in range(lanes):
-                element[i] = ws[at + i] + value[Value.RIDGE] * trace[i]
-            small.store(ws, at, element)
+        """The tensor's distinct entries and what stands behind them, in the precision of the algebra."""
+        moments = region(p, number, Region.MOMENTS)
+        first = number[p.n + Number.FIRST_PLANE]
+        for k in range(number[p.n + Number.EXTRA] + EXTRA_PLANES):
+            begin = (first + k) * p.n_pixels + p.pixel
+            element = V(0.0)
+            if ti.static(lanes == 1):
+                element = ti.cast(J[begin], precise)
+            else:
+                for i in ti.static(range(lanes)):
+                    element[i] = ti.cast(J[begin + i], precise)
+            ws[moments + k * p.stride] = element
 
     @ti.func
-    def least_squares(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+    def scaled(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """Element (r, c), r >= c, of ``S J S``."""
+        at = region(p, number, Region.MOMENTS) + number[p.n + Number.LOWER + tri(r, c)] * p.stride
+        return ws[at] * (value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c])
+
+    @ti.func
+    def scale(
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
-        """Factor A; the ordinary least-squares solutions (2.15) become the first vectors, fixed patterns the guards."""
-        n, k, flow = number[Number.N], number[Number.SOLUTIONS], number[Number.FLOW]
-        factor = base + number[Region.TENSOR] * stride
-        vectors = base + number[Region.VECTORS] * stride
-        small.cholesky(ws, factor, n, -1, stride)
-        for i in range(lanes):
-            ws[base + number[Region.CONVERGED] * stride + i] = precise(0.0)
-        for j in range(BLOCK):
-            for back in range(n):
-                r = n - 1 - back
-                at = vectors + (r * BLOCK + j) * stride
-                element = ti.Vector.zero(precise, lanes)
-                if r >= flow or j >= k:
-                    start = ti.cast(r - flow == j, precise)
-                    if j >= k:
-                        start = ti.cast((r * (5 + 2 * j) + 3 * j) % 7 - 3, precise) + precise(0.5)
-                    for i in range(lanes):
-                        element[i] = start
-                else:
-                    # The rows of the factor below the flow block are -L_ff^T X: one back substitution is left.
-                    row = factor + tri(flow + j, r) * stride
-                    for i in range(lanes):
-                        element[i] = -ws[row + i]
-                    for m in range(r + 1, flow):
-                        one = factor + tri(m, r) * stride
-                        two = vectors + (m * BLOCK + j) * stride
-                        for i in range(lanes):
-                            element[i] -= ws[one + i] * ws[two + i]
-                    diagonal = factor + tri(r, r) * stride
-                    for i in range(lanes):
-                        element[i] *= ws[diagonal + i]
-                small.store(ws, at, element)
+        """``A = S J S``, packed, with a ridge."""
+        n = number[p.n + Number.N]
+        packed = region(p, number, Region.TENSOR)
+        trace = V(0.0)
+        for r in range(n):
+            for c in range(r + 1):
+                element = scaled(r, c, p, number, value, ws)
+                ws[packed + tri(r, c) * p.stride] = element
+                if r == c:
+                    trace = trace + element
+        for r in range(n):
+            at = packed + tri(r, r) * p.stride
+            ws[at] = ws[at] + trace * value[p.v + Value.RIDGE]
 
     @ti.func
     def factorise(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
-        """Factor A alone."""
-        small.cholesky(ws, base + number[Region.TENSOR] * stride, number[Number.N], -1, stride)
+        """Factor A."""
+        small.cholesky(ws, region(p, number, Region.TENSOR), number[p.n + Number.N], -1, p.stride)
+
+    @ti.func
+    def least_squares(
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
+    ):  # fmt: skip
+        """The ordinary least-squares solutions (2.15) become the first vectors, fixed patterns the guards."""
+        n, k, flow = number[p.n + Number.N], number[p.n + Number.SOLUTIONS], number[p.n + Number.FLOW]
+        block = number[p.n + Number.BLOCK]
+        factor, vectors = region(p, number, Region.TENSOR), region(p, number, Region.VECTORS)
+        ws[region(p, number, Region.CONVERGED)] = V(0.0)
+        for j in range(block):
+            for back in range(n):
+                r = n - 1 - back
+                element = V(0.0)
+                if j >= k:
+                    element = V(ti.cast((r * (5 + 2 * j) + 3 * j) % 7 - 3, precise) + precise(0.5))
+                elif r >= flow:
+                    element = V(ti.cast(r - flow == j, precise))
+                else:
+                    # The rows of the factor below the flow block are -L_ff^T X: one back substitution is left.
+                    element = 0.0 - ws[factor + tri(flow + j, r) * p.stride]
+                    for m in range(r + 1, flow):
+                        one = factor + tri(m, r) * p.stride
+                        element = element - ws[one] * ws[vectors + (m * block + j) * p.stride]
+                    element = element * ws[factor + tri(r, r) * p.stride]
+                ws[vectors + (r * block + j) * p.stride] = element
 
     @ti.func
     def accept(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
         """Take the vectors as they are: the solution was direct."""
-        done = ti.Vector.zero(precise, lanes)
-        for i in range(lanes):
-            done[i] = 1.0
-        keep(base, base + number[Region.VECTORS] * stride, BLOCK, stride, done, number, ws)
+        all_lanes = V(0.0) < V(1.0)
+        keep(region(p, number, Region.VECTORS), number[p.n + Number.BLOCK], all_lanes, p, number, ws)
 
     @ti.func
     def keep(
-        base: ti.i32, source: ti.i32, width: ti.i32, stride: ti.i32,
-        done: ti.template(), number: ti.template(), ws: ti.template(),
-    ):  # fmt: skip
+        source: ti.i32, width: ti.i32, done: ti.template(), p: ti.template(), number: ti.template(), ws: ti.template()
+    ):
         """The first vectors [n, width] at ``source`` solve the pixels that are ``done`` and were not before."""
-        n, k = number[Number.N], number[Number.SOLUTIONS]
-        solution = base + number[Region.SOLUTION] * stride
-        flag = base + number[Region.CONVERGED] * stride
-        fresh = ti.Vector.zero(precise, lanes)
-        for i in range(lanes):
-            fresh[i] = done[i] * (1.0 - ws[flag + i])
+        n, k = number[p.n + Number.N], number[p.n + Number.SOLUTIONS]
+        solution, flag = region(p, number, Region.SOLUTION), region(p, number, Region.CONVERGED)
+        fresh = done & (ws[flag] < V(0.5))
         for r in range(n):
             for j in range(k):
-                at = solution + (r * k + j) * stride
-                one = source + (r * width + j) * stride
-                element = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ti.select(fresh[i] > 0.5, ws[one + i], ws[at + i])
-                small.store(ws, at, element)
-        for i in range(lanes):
-            fresh[i] += ws[flag + i]
-        small.store(ws, flag, fresh)
+                at = solution + (r * k + j) * p.stride
+                ws[at] = ti.select(fresh, ws[source + (r * width + j) * p.stride], ws[at])
+        ws[flag] = ti.select(fresh, V(1.0), ws[flag])
 
     @ti.func
-    def any_left(base: ti.i32, stride: ti.i32, number: ti.template(), ws: ti.template()) -> ti.i32:
+    def any_left(p: ti.template(), number: ti.template(), ws: ti.template()) -> ti.i32:
         """Whether a pixel of the group has no solution yet."""
-        left = 0
-        for i in range(lanes):
-            left |= ti.cast(ws[base + number[Region.CONVERGED] * stride + i] < 0.5, ti.i32)
-        return left
+        return small.any_lane(ws[region(p, number, Region.CONVERGED)] < V(0.5))
 
     @ti.func
     def inverse_iteration(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
         """Rounds of block inverse iteration and Rayleigh-Ritz until all have converged.
 
         A pixel keeps the solution of its first round that is good enough, so it does not depend on its neighbours.
         """
         for _ in range(ROUNDS):
-            if any_left(base, stride, number, ws) == 1:
-                one_round(base, stride, number, value, ws)
+            if any_left(p, number, ws) == 1:
+                one_round(p, number, value, ws)
 
     @ti.func
-    def one_round(base: ti.i32, stride: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()):
-        n, k = number[Number.N], number[Number.SOLUTIONS]
-        factor = base + number[Region.TENSOR] * stride
-        vectors = base + number[Region.VECTORS] * stride
-        images = base + number[Region.IMAGES] * stride
-        ritz = base + number[Region.RITZ] * stride
-        turn = base + number[Region.RITZ_VECTORS] * stride
-        for _ in range(number[Number.ITERATIONS]):
-            small.solve(ws, factor, vectors, n, BLOCK, stride)
-            for j in range(BLOCK):
-                for m in range(j):
-                    overlap = small.dot(ws, vectors + m * stride, BLOCK, vectors + j * stride, BLOCK, n, stride)
+    def one_round(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        n, k, block = number[p.n + Number.N], number[p.n + Number.SOLUTIONS], number[p.n + Number.BLOCK]
+        stride = p.stride
+        factor, vectors = region(p, number, Region.TENSOR), region(p, number, Region.VECTORS)
+        images, ritz = region(p, number, Region.IMAGES), region(p, number, Region.RITZ)
+        for _ in range(number[p.n + Number.ITERATIONS]):
+            small.solve(ws, factor, vectors, n, block, stride)
+            for j in range(block):
+                own = vectors + j * stride
+                for m in range(j + 1):
+                    # Minus its share of those before; m = j: to unit length.
+                    other = vectors + m * stride
+                    overlap = small.dot(ws, other, block, own, block, n, stride)
+                    share, length = overlap, V(1.0)
+                    if m == j:
+                        share, length = V(0.0), 1.0 / ti.sqrt(ti.max(overlap, V(1e-30)))
                     for r in range(n):
-                        one = vectors + (r * BLOCK + m) * stride
-                        two = vectors + (r * BLOCK + j) * stride
-                        element = ti.Vector.zero(precise, lanes)
-                        for i in range(lanes):
-                            element[i] = ws[two + i] - overlap[i] * ws[one + i]
-                        small.store(ws, two, element)
-                norm = small.dot(ws, vectors + j * stride, BLOCK, vectors + j * stride, BLOCK, n, stride)
-                for i in range(lanes):
-                    norm[i] = 1.0 / ti.sqrt(ti.max(norm[i], precise(1e-30)))
-                for r in range(n):
-                    at = vectors + (r * BLOCK + j) * stride
-                    element = ti.Vector.zero(precise, lanes)
-                    for i in range(lanes):
-                        element[i] = ws[at + i] * norm[i]
-                    small.store(ws, at, element)
-        small.upper_times(ws, factor, vectors, images, n, BLOCK, stride)
-        for j in range(BLOCK):
-            for m in range(BLOCK):
-                product = small.dot(ws, images + j * stride, BLOCK, images + m * stride, BLOCK, n, stride)
+                        at = r * block * stride
+                        ws[own + at] = (ws[own + at] - share * ws[other + at]) * length
+        small.upper_times(ws, factor, vectors, images, n, block, stride)
+        for j in range(block):
+            for m in range(block):
+                product = small.dot(ws, images + j * stride, block, images + m * stride, block, n, stride)
                 if j >= n or m >= n:
                     # A block wider than the space: rounding is all that is left for its last vectors.
-                    for i in range(lanes):
-                        product[i] = ti.select(j == m, precise(1e30), precise(0.0))
-                small.store(ws, ritz + (j * BLOCK + m) * stride, product)
-        small.jacobi(ws, ritz, BLOCK, RITZ_SWEEPS, stride)
-        small.sort_eigen(ws, ritz, BLOCK, k, stride)
-        small.times_small(ws, vectors, turn, 2 * n, BLOCK, stride)  # and the images, which lie behind
+                    product = V(ti.select(j == m, precise(1e30), precise(0.0)))
+                ws[ritz + (j * block + m) * stride] = product
+        small.jacobi(ws, ritz, block, RITZ_SWEEPS, stride)
+        small.sort_eigen(ws, ritz, block, k, stride)
+        turn, work = ritz + block * block * stride, region(p, number, Region.RITZ_WORK)
+        small.times_small(ws, vectors, turn, work, n, block, stride)
+        small.times_small(ws, images, turn, work, n, block, stride)
         # A v = L (L^T v); its distance from θ v, against the gap to the next Ritz value, bounds the angle left.
-        error = ti.Vector.zero(precise, lanes)
+        error = V(0.0)
         for j in range(k):
-            theta = ritz + (j * BLOCK + j) * stride
+            theta = ws[ritz + (j * block + j) * stride]
             for r in range(n):
-                diagonal = factor + tri(r, r) * stride
-                own = images + (r * BLOCK + j) * stride
-                rest = vectors + (r * BLOCK + j) * stride
-                element = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ws[own + i] / ws[diagonal + i] - ws[theta + i] * ws[rest + i]
+                at = (r * block + j) * stride
+                rest = ws[images + at] / ws[factor + tri(r, r) * stride] - theta * ws[vectors + at]
+                row = factor + tri(r, 0) * stride
                 for m in range(r):
-                    one = factor + tri(r, m) * stride
-                    two = images + (m * BLOCK + j) * stride
-                    for i in range(lanes):
-                        element[i] += ws[one + i] * ws[two + i]
-                for i in range(lanes):
-                    error[i] += element[i] * element[i]
-        last = ritz + ((k - 1) * BLOCK + k - 1) * stride
-        following = ritz + (k * BLOCK + k) * stride
-        done = ti.Vector.zero(precise, lanes)
-        for i in range(lanes):
-            gap = (ws[following + i] - ws[last + i]) * value[Value.GAP]
-            done[i] = ti.cast(not error[i] > gap * gap, precise)
-        keep(base, vectors, BLOCK, stride, done, number, ws)
+                    rest = rest + ws[row + m * stride] * ws[images + (m * block + j) * stride]
+                error = error + rest * rest
+        following, last = ws[ritz + (k * block + k) * stride], ws[ritz + ((k - 1) * block + k - 1) * stride]
+        gap = (following - last) * value[p.v + Value.GAP]
+        keep(vectors, block, not (error > gap * gap), p, number, ws)
 
     @ti.func
     def jacobi(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
         """Full cyclic Jacobi for the pixels that have no solution yet."""
-        n, k = number[Number.N], number[Number.SOLUTIONS]
-        full = base + number[Region.FULL] * stride
-        if any_left(base, stride, number, ws) == 1:
+        n, k = number[p.n + Number.N], number[p.n + Number.SOLUTIONS]
+        full = region(p, number, Region.FULL)
+        if any_left(p, number, ws) == 1:
             for r in range(n):
                 for c in range(n):
-                    begin = number[Number.LOWER + tri(ti.max(r, c), ti.min(r, c))] * n_pixels + pixel
-                    s = value[Value.SCALE + r] * value[Value.SCALE + c]
-                    element = ti.Vector.zero(precise, lanes)
-                    for i in range(lanes):
-                        element[i] = ti.cast(J[begin + i], precise) * s
-                    small.store(ws, full + (r * n + c) * stride, element)
-            small.jacobi(ws, full, n, JACOBI_SWEEPS, stride)
-            small.sort_eigen(ws, full, n, k, stride)
-            done = ti.Vector.zero(precise, lanes)
-            for i in range(lanes):
-                done[i] = 1.0
-            keep(base, base + number[Region.FULL_VECTORS] * stride, n, stride, done, number, ws)
+                    element = scaled(ti.max(r, c), ti.min(r, c), p, number, value, ws)
+                    ws[full + (r * n + c) * p.stride] = element
+            small.jacobi(ws, full, n, JACOBI_SWEEPS, p.stride)
+            small.sort_eigen(ws, full, n, k, p.stride)
+            all_lanes = V(0.0) < V(1.0)
+            keep(full + n * n * p.stride, n, all_lanes, p, number, ws)
 
     @ti.func
     def parameters(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
-        """Combine the vectors so that one time-like differential is 1 and the others 0 (section 3.3.2)."""
-        k, flow = number[Number.SOLUTIONS], number[Number.FLOW]
-        vectors = base + number[Region.SOLUTION] * stride
-        target = base + number[Region.PARAMETERS] * stride
-        for i in range(lanes):
-            m = ti.Matrix.identity(precise, 3)
-            for r in ti.static(range(3)):
-                for c in ti.static(range(3)):
-                    if r < k and c < k:
-                        m[r, c] = ws[vectors + ((flow + r) * k + c) * stride + i] * value[Value.SCALE + flow + r]
-            inverse = m.inverse()
+        """Combine the vectors so that one time-like differential is 1 and the others 0 (section 3.3.2).
+
+        ``P = V_f M^-1`` with M [k, k] the time-like rows: one column of M after the other is eliminated in place.
+        """
+        n, k, flow = number[p.n + Number.N], number[p.n + Number.SOLUTIONS], number[p.n + Number.FLOW]
+        vectors, target = region(p, number, Region.SOLUTION), region(p, number, Region.PARAMETERS)
+        for r in range(n):
+            for c in range(k):
+                at = vectors + (r * k + c) * p.stride
+                ws[at] = ws[at] * value[p.v + Value.SCALE + r]
+        for j in range(k):
+            # The largest of row j among the columns that are left becomes its pivot.
+            row = vectors + (flow + j) * k * p.stride
+            for c in range(j + 1, k):
+                larger = small.magnitude(ws[row + c * p.stride]) > small.magnitude(ws[row + j * p.stride])
+                for r in range(n):
+                    one = vectors + (r * k + j) * p.stride
+                    two = vectors + (r * k + c) * p.stride
+                    first, second = ws[one], ws[two]
+                    ws[one] = ti.select(larger, second, first)
+                    ws[two] = ti.select(larger, first, second)
+            inverse = 1.0 / ws[row + j * p.stride]
+            for c in range(k):
+                if c != j:
+                    factor = ws[row + c * p.stride] * inverse
+                    for r in range(n):
+                        at = vectors + r * k * p.stride
+                        ws[at + c * p.stride] = ws[at + c * p.stride] - factor * ws[at + j * p.stride]
+            for r in range(n):
+                at = vectors + (r * k + j) * p.stride
+                ws[at] = ws[at] * inverse
+        for j in range(k):
             for f in range(flow):
-                v = ti.Vector.zero(precise, 3)
-                for c in ti.static(range(3)):
-                    if c < k:
-                        v[c] = ws[vectors + (f * k + c) * stride + i] * value[Value.SCALE + f]
-                for j in ti.static(range(3)):
-                    if j < k:
-                        p = v[0] * inverse[0, j] + v[1] * inverse[1, j] + v[2] * inverse[2, j]
-                        ws[target + (j * flow + f) * stride + i] = p
+                ws[target + (j * flow + f) * p.stride] = ws[vectors + (f * k + j) * p.stride]
 
     @ti.func
     def residuals(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
         """Image noise variance ``p^T J p / p^T C p`` that the residual of each solution amounts to."""
-        n, k, flow = number[Number.N], number[Number.SOLUTIONS], number[Number.FLOW]
-        factor = base + number[Region.TENSOR] * stride
-        vectors = base + number[Region.VECTORS] * stride
-        images = base + number[Region.IMAGES] * stride
-        for j in range(BLOCK):
-            norm = ti.Vector.zero(precise, lanes)
-            for r in range(n):
-                element = ti.Vector.zero(precise, lanes)
-                if j < k and r < flow:
-                    at = base + (number[Region.PARAMETERS] + j * flow + r) * stride
-                    for i in range(lanes):
-                        element[i] = ws[at + i] / value[Value.SCALE + r]
-                elif j < k and r == flow + j:
-                    for i in range(lanes):
-                        element[i] = 1.0 / value[Value.SCALE + r]
-                noise = value[Value.NOISE + r] * value[Value.SCALE + r] * value[Value.SCALE + r]
-                for i in range(lanes):
-                    norm[i] += noise * element[i] * element[i]
-                small.store(ws, vectors + (r * BLOCK + j) * stride, element)
-            if j < k:
-                small.store(ws, base + (number[Region.VARIANCE] + j) * stride, norm)
-        small.upper_times(ws, factor, vectors, images, n, BLOCK, stride)
+        n, k, flow = number[p.n + Number.N], number[p.n + Number.SOLUTIONS], number[p.n + Number.FLOW]
+        vectors, images = region(p, number, Region.VECTORS), region(p, number, Region.IMAGES)
+        found = region(p, number, Region.PARAMETERS)
         for j in range(k):
-            energy = small.dot(ws, images + j * stride, BLOCK, images + j * stride, BLOCK, n, stride)
-            at = base + (number[Region.VARIANCE] + j) * stride
-            for i in range(lanes):
-                energy[i] /= ws[at + i]
-            small.store(ws, at, energy)
+            norm = V(0.0)
+            for r in range(n):
+                unit = precise(1.0) / value[p.v + Value.SCALE + r]
+                element = V(ti.select(r == flow + j, unit, precise(0.0)))
+                if r < flow:
+                    element = ws[found + (j * flow + r) * p.stride] * unit
+                norm = norm + element * element * (value[p.v + Value.NOISE + r] / (unit * unit))
+                ws[vectors + (r * k + j) * p.stride] = element
+            ws[region(p, number, Region.VARIANCE) + j * p.stride] = norm
+        small.upper_times(ws, region(p, number, Region.TENSOR), vectors, images, n, k, p.stride)
+        for j in range(k):
+            at = region(p, number, Region.VARIANCE) + j * p.stride
+            own = images + j * p.stride
+            ws[at] = small.dot(ws, own, k, own, k, n, p.stride) / ws[at]
 
     @ti.func
     def centre(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
         """Parameters of constants become values at the window's centre, where centred squares are not 0."""
-        for j in range(number[Number.SOLUTIONS]):
-            first = base + (number[Region.PARAMETERS] + j * number[Number.FLOW]) * stride
-            for term in range(number[Number.CENTRE_TERMS]):
-                at = first + number[Number.CENTRE + 2 * term] * stride
-                square = first + number[Number.CENTRE + 2 * term + 1] * stride
-                for i in range(lanes):
-                    ws[at + i] += value[Value.CENTRE + term] * ws[square + i]
+        found = region(p, number, Region.PARAMETERS)
+        for j in range(number[p.n + Number.SOLUTIONS]):
+            first = found + j * number[p.n + Number.FLOW] * p.stride
+            for term in range(number[p.n + Number.CENTRE_TERMS]):
+                at = first + number[p.n + Number.CENTRE + 2 * term] * p.stride
+                square = first + number[p.n + Number.CENTRE + 2 * term + 1] * p.stride
+                ws[at] = ws[at] + ws[square] * value[p.v + Value.CENTRE + term]
 
-    stages = (load, least_squares, factorise, accept, inverse_iteration, jacobi, parameters, residuals, centre)
-    return SimpleNamespace(**{f.__name__: batch_kernel(spec, f) for f in stages})
+    stages = (
+        load, scale, factorise, least_squares, accept, inverse_iteration, jacobi, parameters, residuals, centre,
+    )  # fmt: skip
+    return SimpleNamespace(**{f.__name__: f for f in stages})

@@ -7,371 +7,338 @@ are formulas of ``patch``.
 """
 
 import functools
+from types import SimpleNamespace
 
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
-from leafflow_ti.kernels.patch import RANGE_CODE, patch_functions
+from leafflow_ti.kernels.group import region
+from leafflow_ti.kernels.patch import RANGE_CODE, Patch, patch_functions
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.texture import texture_function
-from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value, batch_kernel
+from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value
 
-START, CLEAR, FINISH, DIFFERENCES = 1, 2, 4, 8
-"""What a launch does besides adding its rows: forget the motion, forget the sums (both before), solve (after), find the
-covariances of difference quotients (in every launch of a fit, or in none)."""
+START, CLEAR, FINISH, COVARIANCE, DIFFERENCES = 1, 2, 4, 8, 16
+"""What a step does besides adding its rows: forget the motion, forget the sums (both before), solve (after), find the
+covariance, and those of difference quotients (these in every step of a fit, or in none)."""
 
 
 @functools.cache
-def patch_fit_kernel(spec: KernelSpec):
-    """The stage that adds a set of rows to the sums, and solves for the motion and its covariance with the last one.
-
-    Its ``which`` is a sum of ``START``, ``CLEAR``, ``DIFFERENCES`` and ``FINISH``.
-    """
-    precise, lanes = spec.precise, spec.lanes
+def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
+    """The stage ``patch_fit``: adds a set of rows to the sums, and solves for the motion and its covariance with the
+    last one. Its ``which`` is a sum of the above."""
+    precise, V = spec.precise, spec.element
     small, patch, smoothness = dense(spec), patch_functions(spec), texture_function(spec)
 
     @ti.func
-    def any_row(
-        r: ti.i32, ray: ti.template(), s: ti.template(), N: ti.template(), number: ti.template(), value: ti.template()
-    ):
-        offsets = number[Number.OFFSETS]
-        row = patch.range_row(value[Value.F], s)
-        if r < 2 * offsets:
-            k = r // offsets
-            row = patch.motion_row(k, number[Number.OFFSET_CODES + r - k * offsets], ray, s, N, value)
-        return row
-
-    @ti.func
-    def equation_error(
-        r: ti.i32, row: ti.template(), motion: ti.template(), s: ti.template(),
-        number: ti.template(), value: ti.template(),
-    ):  # fmt: skip
-        """What an equation leaves out: a share of the sizes of its terms; mixed derivatives also one of the turning."""
-        offsets = number[Number.OFFSETS]
+    def code_of(r: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
+        """Offset of an equation: those of the motion rows, then the range constraint."""
+        offsets = number[p.n + Number.OFFSETS]
         code = RANGE_CODE
         if r < 2 * offsets:
-            code = number[Number.OFFSET_CODES + r % offsets]
-        size = precise(0.0)
-        for j in ti.static(range(MAX_UNKNOWNS)):
-            size += ti.abs(row[j] * motion[j])
-        turning = precise(0.0)
-        if code == 3 or code == 4 or code == RANGE_CODE:
-            turn = ti.Vector([motion[3], motion[4], motion[5]], dt=precise).norm()
-            turning = value[Value.F] / ti.abs(s[0]) * turn * ti.sqrt(1 + s[1] * s[1] + s[2] * s[2])
-            if code != RANGE_CODE:
-                turning *= ti.abs(value[Value.BASELINE + code - 3])
-        return value[Value.MODEL_ERROR + code] * size + value[Value.TURNING_ERROR] * turning
+            code = number[p.n + Number.OFFSET_CODES + r % offsets]
+        return code
 
     @ti.func
-    def design(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_rows: ti.i32,
-        number: ti.template(), value: ti.template(), ws: ti.template(),
-    ):  # fmt: skip
+    def make_row(r: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """Leave the coefficients of equation ``r`` in ROW; what they give for the present motion."""
+        code, offsets = code_of(r, p, number), number[p.n + Number.OFFSETS]
+        result = V(0.0)
+        if code == RANGE_CODE:
+            result = patch.range_row(p, number, value, ws)
+        else:
+            result = patch.motion_row(r // offsets, code, p, number, value, ws)
+        return result
+
+    @ti.func
+    def equation_error(r: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """What an equation leaves out: a share of the sizes of its terms; mixed derivatives also one of the turning."""
+        row, motion = region(p, number, Region.ROW), region(p, number, Region.MOTION)
+        at = region(p, number, Region.PATCH)
+        code = code_of(r, p, number)
+        size = V(0.0)
+        for j in range(MAX_UNKNOWNS):
+            size = size + small.magnitude(ws[row + j * p.stride] * ws[motion + j * p.stride])
+        result = size * value[p.v + Value.MODEL_ERROR + code]
+        if code == 3 or code == 4 or code == RANGE_CODE:
+            factor = value[p.v + Value.TURNING_ERROR] * value[p.v + Value.F]
+            if code != RANGE_CODE:
+                factor *= ti.abs(value[p.v + Value.BASELINE + code - 3])
+            turn = motion + 3 * p.stride
+            ZX, ZY = ws[at + Patch.SLOPE_X * p.stride], ws[at + Patch.SLOPE_Y * p.stride]
+            turning = ti.sqrt(small.dot(ws, turn, 1, turn, 1, 3, p.stride) * (ZX * ZX + ZY * ZY + 1.0))
+            result = result + turning * small.magnitude(ws[at + Patch.INVERSE_DEPTH * p.stride]) * factor
+        return result
+
+    @ti.func
+    def design(n_rows: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Rows of the system, linearised about the present motion, their measured values, and their sensitivity.
 
         An own flow is measured at the reference's preshifted pixel and moved to where the patch point projects by the
-        flow's own derivatives. The sensitivity is the derivative of the rows' residual by the geometry, by central
-        differences: variant 0 of the loop is the geometry itself, two more for each of its terms are displaced.
+        flow's own derivatives. The sensitivity is the derivative of the rows' residual by the geometry, by differences:
+        variant 0 of the loop is the geometry itself, in the others one of its terms is displaced.
         """
-        flow, terms, offsets = number[Number.FLOW], number[Number.TERMS], number[Number.OFFSETS]
-        target = base + number[Region.DESIGN] * stride
-        measured = base + number[Region.VALUE] * stride
-        left_out = base + number[Region.LEFT_OUT] * stride
-        derivative = base + number[Region.DERIVATIVE] * stride
-        g = base + number[Region.GEOMETRY] * stride
-        q = base + number[Region.MOTION] * stride
-        parameters = base + (number[Region.PARAMETERS] + number[Number.MOTION_SOLUTION] * flow) * stride
-        for r in range(n_rows):
-            for term in range(terms):
-                own = ti.cast(r == 2 * offsets and term == number[Number.RANGE_TERM], precise)
-                for i in range(lanes):
-                    ws[derivative + (r * terms + term) * stride + i] = own
-        for i in range(lanes):
-            seen = patch.pixel_ray(pixel + i, number, value)
-            ray = seen
-            for k in ti.static(range(2)):
-                ray[k] += ws[g + i] * value[Value.BASELINE + k] * value[Value.CAMERA_STEP + k] / value[Value.F]
-            motion = ti.Vector.zero(precise, MAX_UNKNOWNS)
-            for j in ti.static(range(MAX_UNKNOWNS)):
-                motion[j] = ws[q + j * stride + i]
-            N = ti.Vector([motion[0], motion[1], motion[2]], dt=precise)
-            for variant in range(1 + 2 * ti.min(terms, 3)):
-                term = (variant - 1) // 2
-                nu = ws[g + i]
-                h = value[Value.STEP_SIZE] * ti.abs(nu) * (1.0 - 2.0 * ti.cast(variant % 2, precise))
-                if term > 0:
-                    h /= value[Value.F]
-                b = ti.Vector.zero(precise, 2)
-                if terms > 1:
-                    b[0] = ws[g + stride + i] + ti.select(term == 1, h, precise(0.0))
-                    b[1] = ws[g + 2 * stride + i] + ti.select(term == 2, h, precise(0.0))
-                if variant > 0 and term == 0:
-                    nu += h
-                s = patch.surface(seen, value[Value.F], nu, b[0], b[1])
-                s[3] = 1 - s[1] * ray[0] - s[2] * ray[1]
-                for r in range(n_rows):
-                    row = any_row(r, ray, s, N, number, value)
-                    if variant == 0:
-                        for j in ti.static(range(MAX_UNKNOWNS)):
-                            place = number[Number.PLACE + j]
-                            if place >= 0:
-                                ws[target + (r * MAX_UNKNOWNS + place) * stride + i] = row[j]
-                        ws[left_out + r * stride + i] = equation_error(r, row, motion, s, number, value)
-                    else:
-                        ws[derivative + (r * terms + term) * stride + i] -= row.dot(motion) / (2 * h)
+        n, terms, offsets = number[p.n + Number.UNKNOWNS], number[p.n + Number.TERMS], number[p.n + Number.OFFSETS]
+        derivative, found = region(p, number, Region.DERIVATIVE), region(p, number, Region.MOTION_WORK)
+        at, g = region(p, number, Region.PATCH), region(p, number, Region.GEOMETRY)
+        nu, b1, b2 = ws[g], V(0.0), V(0.0)
+        if terms > 1:
+            b1, b2 = ws[g + p.stride], ws[g + 2 * p.stride]
+        x, y = patch.pixel_ray(p, number, value)
+        ws[at + Patch.SEEN_X * p.stride], ws[at + Patch.SEEN_Y * p.stride] = x, y
+        for k in range(2):
+            step = value[p.v + Value.BASELINE + k] * value[p.v + Value.CAMERA_STEP + k] / value[p.v + Value.F]
+            ws[at + (Patch.X + k) * p.stride] = ws[at + (Patch.SEEN_X + k) * p.stride] + nu * step
+        small.clear(ws, derivative, n_rows * terms, p.stride)
+        if number[p.n + Number.RANGE_TERM] >= 0 and n_rows > 2 * offsets:
+            ws[derivative + (2 * offsets * terms + number[p.n + Number.RANGE_TERM]) * p.stride] = V(1.0)
+        for variant in range(1 + ti.min(terms, 3)):
+            # Like a derivative of the disparity, b counts per pixel.
+            step = value[p.v + Value.STEP_SIZE]
+            if variant > 1:
+                step /= value[p.v + Value.F]
+            h = small.magnitude(nu) * step
+            inverse = 1.0 / h
+            patch.place_patch(
+                nu + h * ti.cast(variant == 1, precise), b1 + h * ti.cast(variant == 2, precise),
+                b2 + h * ti.cast(variant == 3, precise), p, number, value, ws,
+            )  # fmt: skip
             for r in range(n_rows):
-                at = g + number[Number.RANGE_TERM] * stride
-                if r < 2 * offsets:
-                    at = parameters + number[Number.MOTION_ROWS + r] * stride
-                found = ws[at + i]
-                if number[Number.OWN_FLOW] == 1 and r % offsets == 0:
-                    for k in range(2):
-                        column = number[Number.MOVE + 2 * (r // offsets) + k]
-                        found += own_shift(k, ws[g + i], value) * ws[parameters + column * stride + i]
-                ws[measured + r * stride + i] = found
+                result = make_row(r, p, number, value, ws)
+                if variant == 0:
+                    for j in range(MAX_UNKNOWNS):
+                        place = number[p.n + Number.PLACE + j]
+                        if place >= 0:
+                            target = region(p, number, Region.DESIGN) + (r * n + place) * p.stride
+                            ws[target] = ws[region(p, number, Region.ROW) + j * p.stride]
+                    error = equation_error(r, p, number, value, ws)
+                    ws[region(p, number, Region.LEFT_OUT) + r * p.stride] = error
+                    ws[found + r * p.stride] = result
+                else:
+                    here = derivative + (r * terms + variant - 1) * p.stride
+                    ws[here] = ws[here] - (result - ws[found + r * p.stride]) * inverse
+        measure(n_rows, p, number, value, ws)
 
     @ti.func
-    def own_shift(k: ti.i32, nu: precise, value: ti.template()):
-        """Pixels from the preshifted pixel to where the patch point projects into an own flow's camera."""
-        return value[Value.CAMERA_STEP + k] * (nu * value[Value.BASELINE + k] - value[Value.SHIFT + k])
+    def measure(n_rows: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """VALUE: the measured values of the rows."""
+        offsets, g = number[p.n + Number.OFFSETS], region(p, number, Region.GEOMETRY)
+        parameters = region(p, number, Region.PARAMETERS)
+        parameters += number[p.n + Number.MOTION_SOLUTION] * number[p.n + Number.FLOW] * p.stride
+        for r in range(n_rows):
+            at = g + number[p.n + Number.RANGE_TERM] * p.stride
+            if r < 2 * offsets:
+                at = parameters + number[p.n + Number.MOTION_ROWS + r] * p.stride
+            found = ws[at]
+            if number[p.n + Number.OWN_FLOW] == 1 and r % offsets == 0:
+                for k in range(2):
+                    # Pixels from the preshifted pixel to where the patch point projects.
+                    moved = ws[g] * value[p.v + Value.BASELINE + k] - value[p.v + Value.SHIFT + k]
+                    column = number[p.n + Number.MOVE + 2 * (r // offsets) + k]
+                    slope = ws[parameters + column * p.stride] * value[p.v + Value.CAMERA_STEP + k]
+                    found = found + moved * slope
+            ws[region(p, number, Region.VALUE) + r * p.stride] = found
 
     @ti.func
-    def row_spread(
-        base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), value: ti.template(), ws: ti.template()
-    ):
+    def row_spread(n_rows: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """OWN: noise of the rows. FACTOR, for the weights: that, the geometry's noise in them, what they leave out."""
-        terms, offsets = number[Number.TERMS], number[Number.OFFSETS]
-        cov_t = base + number[Region.COV_T] * stride
-        cov_g = base + number[Region.GEOMETRY_COV] * stride
-        d = base + number[Region.DERIVATIVE] * stride
+        terms, offsets = number[p.n + Number.TERMS], number[p.n + Number.OFFSETS]
+        cov_t, cov_g = region(p, number, Region.COV_T), region(p, number, Region.GEOMETRY_COV)
+        derivative, half = region(p, number, Region.DERIVATIVE), region(p, number, Region.MOTION_WORK)
+        own_at, factor_at = region(p, number, Region.OWN), region(p, number, Region.FACTOR)
+        for r in range(n_rows):
+            for a in range(terms):
+                one, two = derivative + r * terms * p.stride, cov_g + a * terms * p.stride
+                ws[half + (r * terms + a) * p.stride] = small.dot(ws, one, 1, two, 1, terms, p.stride)
         for r in range(n_rows):
             for c in range(r + 1):
-                spread = ti.Vector.zero(precise, lanes)
+                spread = V(0.0)
                 if r < 2 * offsets:
-                    own = cov_t + tri(r, c) * stride
-                    for i in range(lanes):
-                        spread[i] = ws[own + i]
-                small.store(ws, base + (number[Region.OWN] + tri(r, c)) * stride, spread)
+                    spread = ws[cov_t + tri(r, c) * p.stride]
+                ws[own_at + tri(r, c) * p.stride] = spread
                 if r == c:
-                    left_out = base + (number[Region.LEFT_OUT] + r) * stride
-                    for i in range(lanes):
-                        spread[i] += ws[left_out + i] * ws[left_out + i]
-                for one in range(terms):
-                    da = d + (r * terms + one) * stride
-                    for two in range(terms):
-                        dc = d + (c * terms + two) * stride
-                        own = cov_g + (one * terms + two) * stride
-                        for i in range(lanes):
-                            spread[i] += ws[da + i] * ws[own + i] * ws[dc + i]
-                small.store(ws, base + (number[Region.FACTOR] + tri(r, c)) * stride, spread)
+                    left_out = ws[region(p, number, Region.LEFT_OUT) + r * p.stride]
+                    spread = spread + left_out * left_out
+                one, two = half + r * terms * p.stride, derivative + c * terms * p.stride
+                spread = spread + small.dot(ws, one, 1, two, 1, terms, p.stride)
+                ws[factor_at + tri(r, c) * p.stride] = spread
 
     @ti.func
-    def leave_out(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, n_rows: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
-    ):  # fmt: skip
+    def leave_out(n_rows: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Rows of an own flow whose window has left the image or that follows nothing get zero values and design."""
-        mass = number[Number.EXTRA] * n_pixels + pixel
-        p = base + number[Region.PARAMETERS] * stride
-        used = ti.Vector.zero(precise, lanes)
-        for i in range(lanes):
-            shift = precise(0.0)
-            for k in ti.static(range(2)):
-                shift += ws[p + number[Number.FLOW_ROWS + k] * stride + i] ** 2
-            good = shift < value[Value.MAX_SHIFT] ** 2 and ti.cast(J[mass + i], precise) > value[Value.MIN_MASS]
-            used[i] = ti.cast(good, precise)
+        n, parameters = number[p.n + Number.UNKNOWNS], region(p, number, Region.PARAMETERS)
+        mass = ws[region(p, number, Region.MOMENTS) + number[p.n + Number.EXTRA] * p.stride]
+        shift = V(0.0)
+        for k in range(2):
+            u = ws[parameters + number[p.n + Number.FLOW_ROWS + k] * p.stride]
+            shift = shift + u * u
+        limit = value[p.v + Value.MAX_SHIFT]
+        used = (shift < V(limit * limit)) & (mass > V(value[p.v + Value.MIN_MASS]))
         for r in range(n_rows):
             for c in range(r + 1):
                 # Also where the covariance is no number: a unit matrix in its place.
-                for region in range(2):
-                    at = base + (number[ti.select(region == 0, Region.OWN, Region.FACTOR)] + tri(r, c)) * stride
-                    element = ti.Vector.zero(precise, lanes)
-                    for i in range(lanes):
-                        element[i] = ti.select(used[i] > 0, ws[at + i], ti.cast(r == c, precise))
-                    small.store(ws, at, element)
-            for j in range(MAX_UNKNOWNS + 1):
-                at = base + (number[Region.DESIGN] + r * MAX_UNKNOWNS + j) * stride
-                if j == MAX_UNKNOWNS:
-                    at = base + (number[Region.VALUE] + r) * stride
-                element = ti.Vector.zero(precise, lanes)
-                for i in range(lanes):
-                    element[i] = ti.select(used[i] > 0, ws[at + i], precise(0.0))
-                small.store(ws, at, element)
+                unit = V(ti.cast(r == c, precise))
+                for name in range(2):
+                    at = ti.select(name == 0, region(p, number, Region.OWN), region(p, number, Region.FACTOR))
+                    at += tri(r, c) * p.stride
+                    ws[at] = ti.select(used, ws[at], unit)
+            for j in range(n + 1):
+                at = region(p, number, Region.DESIGN) + (r * n + j) * p.stride
+                if j == n:
+                    at = region(p, number, Region.VALUE) + r * p.stride
+                ws[at] = ti.select(used, ws[at], V(0.0))
 
     @ti.func
-    def weigh(base: ti.i32, stride: ti.i32, n_rows: ti.i32, number: ti.template(), ws: ti.template()):
+    def weigh(n_rows: ti.i32, p: ti.template(), number: ti.template(), ws: ti.template()):
         """WEIGHTED becomes ``W A``, with plain least squares A itself."""
-        n = number[Number.UNKNOWNS]
-        factor = base + number[Region.FACTOR] * stride
-        weighted = base + number[Region.WEIGHTED] * stride
-        for r in range(n_rows):
-            a = base + (number[Region.DESIGN] + r * MAX_UNKNOWNS) * stride
-            small.copy(ws, a, weighted + r * n * stride, n, stride)
-        if number[Number.WEIGHTED] == 1:
-            small.cholesky(ws, factor, n_rows, -1, stride)
-            small.solve(ws, factor, weighted, n_rows, n, stride)
-
-    @ti.func
-    def add(ws: ti.template(), at: ti.i32, term: ti.template()):
-        """Add a vector over the lanes to one element."""
-        total = ti.Vector.zero(precise, lanes)
-        for i in range(lanes):
-            total[i] = ws[at + i] + term[i]
-        small.store(ws, at, total)
+        n = number[p.n + Number.UNKNOWNS]
+        factor, weighted = region(p, number, Region.FACTOR), region(p, number, Region.WEIGHTED)
+        small.copy(ws, region(p, number, Region.DESIGN), weighted, n_rows * n, p.stride)
+        if number[p.n + Number.WEIGHTED] == 1:
+            small.cholesky(ws, factor, n_rows, -1, p.stride)
+            small.solve(ws, factor, weighted, n_rows, n, p.stride)
 
     @ti.func
     def difference(
-        base: ti.i32, stride: ti.i32, n_rows: ti.i32, axis: ti.i32,
-        number: ti.template(), value: ti.template(), ws: ti.template(),
-    ):  # fmt: skip
+        n_rows: ti.i32, axis: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
+    ):
         """Scale the rows of WEIGHTED by what of their errors a difference quotient along an axis is left with.
 
         Windows side by side share most of their noise; how much, depends on the offset of the row.
         """
-        n, offsets = number[Number.UNKNOWNS], number[Number.OFFSETS]
+        n = number[p.n + Number.UNKNOWNS]
         for r in range(n_rows):
-            code = RANGE_CODE
-            if r < 2 * offsets:
-                code = number[Number.OFFSET_CODES + r % offsets]
-            factor = value[Value.DIFFERENCE + code]
+            code = code_of(r, p, number)
+            factor = value[p.v + Value.DIFFERENCE + code]
             if axis == 1:  # the rows are scaled for x
-                factor = value[Value.DIFFERENCE + RANGE_CODE + 1 + code] / factor
-            at = base + (number[Region.WEIGHTED] + r * n) * stride
+                factor = value[p.v + Value.DIFFERENCE + RANGE_CODE + 1 + code] / factor
+            at = region(p, number, Region.WEIGHTED) + r * n * p.stride
             for e in range(n):
-                for i in range(lanes):
-                    ws[at + e * stride + i] *= factor
+                ws[at + e * p.stride] = ws[at + e * p.stride] * factor
 
     @ti.func
     def accumulate(
-        base: ti.i32, stride: ti.i32, n_rows: ti.i32, variant: ti.i32, number: ti.template(), ws: ti.template()
-    ):
-        """Add the rows to the normal equations (variant 0) and to what the covariance of a variant is made of."""
-        n, terms = number[Number.UNKNOWNS], number[Number.TERMS]
-        spread = number[Region.NORMAL_SPREAD] + variant * n * n
-        left = number[Region.LEFT] + variant * (terms + number[Number.CORRELATED]) * n
-        weighted = base + number[Region.WEIGHTED] * stride
-        work = base + number[Region.MOTION_WORK] * stride
-        small.symmetric_times(ws, base + number[Region.OWN] * stride, weighted, work, n_rows, n, stride)
-        for part in range(ti.select(variant == 0, 4, 2)):
-            x, step, rows, target = number[Region.MOTION_WORK], n, n, spread
-            if part == 1:
-                x, step, rows, target = number[Region.DERIVATIVE], terms, terms, left
-            elif part == 2:
-                x, step, rows, target = number[Region.DESIGN], MAX_UNKNOWNS, n, number[Region.NORMAL]
-            elif part == 3:
-                x, step, rows, target = number[Region.VALUE], 1, 1, number[Region.NORMAL_RHS]
-            for r in range(rows):
-                for c in range(n):
-                    one = base + (x + r) * stride
-                    element = small.dot(ws, one, step, weighted + c * stride, n, n_rows, stride)
-                    add(ws, base + (target + r * n + c) * stride, element)
-
-    @ti.func
-    def correlate(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, variant: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(),
+        n_rows: ti.i32, first: ti.i32, last: ti.i32, variant: ti.i32, p: ti.template(), number: ti.template(),
+        ws: ti.template(),
     ):  # fmt: skip
-        """What the reference's rows share with the geometry, and an own flow's with the reference's rows."""
-        n, terms, rows_t = number[Number.UNKNOWNS], number[Number.TERMS], number[Number.ROWS_T]
-        used = 2 * number[Number.OFFSETS]
-        weighted = base + number[Region.WEIGHTED] * stride
-        first = variant * (terms + number[Number.CORRELATED])
-        kept = base + number[Region.REFERENCE_VARIANCE] * stride
-        variance = base + (number[Region.VARIANCE] + number[Number.MOTION_SOLUTION]) * stride
-        if number[Number.OWN_FLOW] == 0:
-            small.copy(ws, variance, kept, 1, stride)
-            for c in range(n):
-                for a in range(terms + number[Number.CORRELATED]):
-                    # Geometry times motion rows, then the response of the motion rows to the normal equations.
-                    x = base + (number[Region.GEOMETRY_CROSS] + a * rows_t) * stride
-                    at = base + (number[Region.RIGHT] + (first + a) * n + c) * stride
-                    if a >= terms:
-                        x = base + (number[Region.RESPONSE_T] + (a - terms) * rows_t) * stride
-                        at = base + (number[Region.LEFT] + (first + a) * n + c) * stride
-                    add(ws, at, small.dot(ws, x, 1, weighted + c * stride, n, used, stride))
-        else:
-            factor = ti.Vector.zero(precise, lanes)
-            rho = smoothness(pixel, n_pixels, number, J)
-            for i in range(lanes):
-                common = ws[kept + i] * ws[variance + i]
-                factor[i] = ti.select(common > 0, rho[i] * ti.sqrt(common), precise(0.0))
-            for a in range(number[Number.CORRELATED]):
-                partner = number[Number.PARTNER + a]
-                if partner >= 0:
-                    x = base + (number[Region.PRODUCT] + partner * rows_t) * stride
-                    for c in range(n):
-                        term = small.dot(ws, x, 1, weighted + c * stride, n, used, stride)
-                        for i in range(lanes):
-                            term[i] *= factor[i] * value[Value.PARTNER + a]
-                        add(ws, base + (number[Region.RIGHT] + (first + terms + a) * n + c) * stride, term)
+        """Add the rows to the normal equations (parts 0, 1) and to what the covariance of a variant is made of (2, 3).
+
+        Of symmetric sums the lower triangle.
+        """
+        n, terms = number[p.n + Number.UNKNOWNS], number[p.n + Number.TERMS]
+        weighted, work = region(p, number, Region.WEIGHTED), region(p, number, Region.MOTION_WORK)
+        if last > 2:
+            small.symmetric_times(ws, region(p, number, Region.OWN), weighted, work, n_rows, n, p.stride)
+        for part in range(first, last):
+            x, rows, target = region(p, number, Region.DESIGN), n, region(p, number, Region.NORMAL)
+            if part == 1:
+                x, rows, target = region(p, number, Region.VALUE), 1, region(p, number, Region.NORMAL_RHS)
+            elif part == 2:
+                x, target = work, region(p, number, Region.NORMAL_SPREAD) + variant * n * n * p.stride
+            elif part == 3:
+                x, rows = region(p, number, Region.DERIVATIVE), terms
+                target = region(p, number, Region.LEFT)
+                target += variant * (terms + number[p.n + Number.CORRELATED]) * n * p.stride
+            lower = ti.cast(part % 2 == 0, ti.i32)
+            small.add_product(ws, x, rows, weighted, n, n_rows, lower, target, V(1.0), p.stride)
 
     @ti.func
-    def finish(base: ti.i32, stride: ti.i32, variants: ti.i32, number: ti.template(), ws: ti.template()):
+    def correlate(variant: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """What the reference's rows share with the geometry, and an own flow's with the reference's rows."""
+        n, terms, rows_t = number[p.n + Number.UNKNOWNS], number[p.n + Number.TERMS], number[p.n + Number.ROWS_T]
+        used, correlated = 2 * number[p.n + Number.OFFSETS], number[p.n + Number.CORRELATED]
+        weighted = region(p, number, Region.WEIGHTED)
+        first = variant * (terms + correlated)
+        kept = region(p, number, Region.REFERENCE_VARIANCE)
+        left, right = region(p, number, Region.LEFT), region(p, number, Region.RIGHT)
+        variance = region(p, number, Region.VARIANCE) + number[p.n + Number.MOTION_SOLUTION] * p.stride
+        own = number[p.n + Number.OWN_FLOW] == 1
+        factor = V(1.0)
+        if own:
+            common = ws[kept] * ws[variance]
+            root = smoothness(p, number, ws) * ti.sqrt(ti.max(common, V(0.0)))
+            factor = ti.select(common > V(0.0), root, V(0.0))
+        else:
+            ws[kept] = ws[variance]
+        for a in range(terms + correlated):
+            # Geometry times motion rows, then the response of the motion rows to the normal equations.
+            x = region(p, number, Region.GEOMETRY_CROSS) + a * rows_t * p.stride
+            at, scale, shared = right + (first + a) * n * p.stride, V(1.0), not own
+            if a >= terms and not own:
+                x = region(p, number, Region.RESPONSE_T) + (a - terms) * rows_t * p.stride
+                at = left + (first + a) * n * p.stride
+            elif a >= terms:
+                partner = number[p.n + Number.PARTNER + a - terms]
+                shared = partner >= 0
+                x = region(p, number, Region.PRODUCT) + ti.max(partner, 0) * rows_t * p.stride
+                scale = factor * value[p.v + Value.PARTNER + a - terms]
+            if shared:
+                small.add_product(ws, x, 1, weighted, n, used, 0, at, scale, p.stride)
+
+    @ti.func
+    def finish(variants: ti.i32, p: ti.template(), number: ti.template(), ws: ti.template()):
         """Motion from the sums, its covariance and, with three variants, those of its difference quotients."""
-        n, terms = number[Number.UNKNOWNS], number[Number.TERMS]
-        normal = base + number[Region.MOTION_WORK] * stride
-        q = base + number[Region.NORMAL_RHS] * stride
+        n, terms = number[p.n + Number.UNKNOWNS], number[p.n + Number.TERMS]
+        normal, q = region(p, number, Region.MOTION_WORK), region(p, number, Region.NORMAL_RHS)
+        cov_g = region(p, number, Region.GEOMETRY_COV)
         for r in range(n):
-            small.copy(ws, base + (number[Region.NORMAL] + r * n) * stride, normal + tri(r, 0) * stride, r + 1, stride)
-        small.cholesky(ws, normal, n, -1, stride)
-        small.solve(ws, normal, q, n, 1, stride)
+            for c in range(r + 1):
+                ws[normal + tri(r, c) * p.stride] = ws[region(p, number, Region.NORMAL) + (r * n + c) * p.stride]
+        small.cholesky(ws, normal, n, -1, p.stride)
+        small.solve(ws, normal, q, n, 1, p.stride)
         for j in range(MAX_UNKNOWNS):
-            if number[Number.PLACE + j] >= 0:
-                place = base + (number[Region.MOTION] + j) * stride
-                small.copy(ws, q + number[Number.PLACE + j] * stride, place, 1, stride)
-        count = terms + number[Number.CORRELATED]
+            place = number[p.n + Number.PLACE + j]
+            if place >= 0:
+                ws[region(p, number, Region.MOTION) + j * p.stride] = ws[q + place * p.stride]
+        count = terms + number[p.n + Number.CORRELATED]
         for variant in range(variants):
-            cov = base + number[Region.MOTION_COV] * stride
+            cov = region(p, number, Region.MOTION_COV)
             if variant > 0:
-                cov = base + (number[Region.DIFFERENCE_COV] + (variant - 1) * n * n) * stride
-            left = base + (number[Region.LEFT] + variant * count * n) * stride
-            right = base + (number[Region.RIGHT] + variant * count * n) * stride
+                cov = region(p, number, Region.DIFFERENCE_COV) + (variant - 1) * n * n * p.stride
+            left = region(p, number, Region.LEFT) + variant * count * n * p.stride
+            right = region(p, number, Region.RIGHT) + variant * count * n * p.stride
+            spread = region(p, number, Region.NORMAL_SPREAD) + variant * n * n * p.stride
             for a in range(terms):
                 # LEFT^T cov LEFT as two transposed halves.
-                x = base + (number[Region.GEOMETRY_COV] + a * terms) * stride
                 for c in range(n):
-                    half = small.dot(ws, x, 1, left + c * stride, n, terms, stride)
-                    for i in range(lanes):
-                        half[i] *= precise(0.5)
-                    add(ws, right + (a * n + c) * stride, half)
+                    at = right + (a * n + c) * p.stride
+                    half = small.dot(ws, cov_g + a * terms * p.stride, 1, left + c * p.stride, n, terms, p.stride)
+                    ws[at] = ws[at] + half * precise(0.5)
             for r in range(n):
-                for c in range(n):
-                    element = ti.Vector.zero(precise, lanes)
-                    own = base + (number[Region.NORMAL_SPREAD] + (variant * n + r) * n + c) * stride
-                    for i in range(lanes):
-                        element[i] = ws[own + i]
-                    for side in range(2):
-                        one = ti.select(side == 0, r, c)
-                        two = ti.select(side == 0, c, r)
-                        part = small.dot(ws, left + one * stride, n, right + two * stride, n, count, stride)
-                        for i in range(lanes):
-                            element[i] += part[i]
-                    small.store(ws, cov + (r * n + c) * stride, element)
-            small.sandwich(ws, normal, cov, n, 2, stride)
+                for c in range(r + 1):
+                    total = ws[spread + (r * n + c) * p.stride]
+                    for k in range(count):
+                        one, two = k * n + r, k * n + c
+                        total = total + ws[left + one * p.stride] * ws[right + two * p.stride]
+                        total = total + ws[left + two * p.stride] * ws[right + one * p.stride]
+                    ws[cov + (r * n + c) * p.stride] = total
+                    ws[cov + (c * n + r) * p.stride] = total
+            small.sandwich(ws, normal, cov, n, 2, p.stride)
 
     @ti.func
     def patch_fit(
-        base: ti.i32, pixel: ti.i32, stride: ti.i32, n_pixels: ti.i32, which: ti.i32,
-        number: ti.template(), value: ti.template(), J: ti.template(), ws: ti.template(), out: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
     ):  # fmt: skip
         """Add the rows of one set; Ω × N and the geometry's noise in the rows are taken at the present motion."""
-        n_rows = 2 * number[Number.OFFSETS] + number[Number.USE_RANGE]
-        first = ti.select(which & START, number[Region.MOTION], number[Region.NORMAL])
-        if which & (START | CLEAR) != 0:
-            for e in range(number[Region.REFERENCE_VARIANCE] - first):
-                for i in range(lanes):
-                    ws[base + (first + e) * stride + i] = precise(0.0)
-        design(base, pixel, stride, n_rows, number, value, ws)
-        row_spread(base, stride, n_rows, number, value, ws)
-        if number[Number.OWN_FLOW] == 1:
-            leave_out(base, pixel, stride, n_pixels, n_rows, number, value, J, ws)
-        weigh(base, stride, n_rows, number, ws)
-        variants = ti.select(which & DIFFERENCES != 0, 3, 1)
-        for variant in range(variants):
+        n_rows = 2 * number[p.n + Number.OFFSETS] + number[p.n + Number.USE_RANGE]
+        if p.which & START != 0:
+            small.clear(ws, region(p, number, Region.MOTION), MAX_UNKNOWNS, p.stride)
+        if p.which & (START | CLEAR) != 0:
+            sums = number[p.n + Region.REFERENCE_VARIANCE] - number[p.n + Region.NORMAL]
+            small.clear(ws, region(p, number, Region.NORMAL), sums, p.stride)
+        design(n_rows, p, number, value, ws)
+        row_spread(n_rows, p, number, value, ws)
+        if number[p.n + Number.OWN_FLOW] == 1:
+            leave_out(n_rows, p, number, value, ws)
+        weigh(n_rows, p, number, ws)
+        variants = ti.select(p.which & DIFFERENCES != 0, 3, ti.select(p.which & COVARIANCE != 0, 1, 0))
+        for variant in range(ti.max(variants, 1)):
             if variant > 0:
-                difference(base, stride, n_rows, variant - 1, number, value, ws)
-            accumulate(base, stride, n_rows, variant, number, ws)
-            correlate(base, pixel, stride, n_pixels, variant, number, value, J, ws)
-        if which & FINISH != 0:
-            finish(base, stride, variants, number, ws)
+                difference(n_rows, variant - 1, p, number, value, ws)
+            accumulate(n_rows, ti.select(variant == 0, 0, 2), ti.select(variants == 0, 2, 4), variant, p, number, ws)
+            if variants > 0:
+                correlate(variant, p, number, value, ws)
+        if p.which & FINISH != 0:
+            finish(variants, p, number, ws)
 
-    return batch_kernel(spec, patch_fit)
+    return SimpleNamespace(patch_fit=patch_fit)

@@ -6,10 +6,12 @@ vectorised loop, and a few tasks share the groups; on a GPU a group is one pixel
 
 from dataclasses import dataclass
 
-from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.engine import lane_type, ti
 
 TASK_GRAIN = 512
 """Iterations that the engine's CPU thread pool hands out at once; a task occupies exactly one such piece."""
+EXTRA_PLANES = 4
+"""Behind a tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
 
 
 @dataclass(frozen=True)
@@ -30,3 +32,8 @@ class KernelSpec:
     def precise(self):
         """Engine type of the small dense matrices."""
         return getattr(ti, self.algebra)
+
+    @property
+    def element(self):
+        """Engine type of one element of the workspace: its value in every lane."""
+        return lane_type(self.precise, self.lanes)

@@ -1,22 +1,19 @@
-"""What the per-pixel kernels share: the workspace of a batch of pixels, and the tables that describe a model to them.
+"""What the per-pixel stages share: the workspace of a group of pixels, and the tables that describe a model to them.
 
-Every per-pixel stage is a function of one group of pixels. It works in regions of one flat workspace (see
-``dense``) and reads what it needs to know from two tables: ``number`` (int32: region offsets, sizes, lists of rows)
-and ``value`` (scales, noise factors, camera). One compilation of a stage serves every model.
+A stage works in regions of one flat workspace (see ``dense``) and reads what it needs to know from two tables:
+``number`` (int32: region offsets, sizes, lists of rows) and ``value`` (scales, noise factors, camera). One compilation
+of a stage serves every model.
 """
 
-import functools
 from dataclasses import dataclass
 from enum import IntEnum, auto
 
 import numpy as np
 
-from leafflow_ti.kernels.engine import ti
-from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
-
 BLOCK = 4
-"""Vectors that the block inverse iteration carries: the solutions and at least one guard."""
+"""Most vectors that the block inverse iteration carries: the solutions and at least one guard."""
 MAX_UNKNOWNS = 10
+PATCH_SIZE = 12
 MAX_ROWS = 16
 MAX_COLUMNS = 32
 MAX_SQUARES = 8
@@ -26,11 +23,13 @@ class Region(IntEnum):
     """Regions; shapes with N columns, k solutions, F = N - k, S and T rows of a camera solution
     and of the motion solution, G geometry terms, M equations and Q unknowns of the motion fit."""
 
-    TENSOR = 0  # packed [N]: scaled structure tensor, then its Cholesky factor
+    MOMENTS = 0  # [entries + extras]: the tensor's distinct entries, window mass, energies
+    TENSOR = auto()  # packed [N]: scaled structure tensor, then its Cholesky factor
     VECTORS = auto()  # [N, BLOCK]: iterated vectors
     IMAGES = auto()  # [N, BLOCK]: factor times vectors
     RITZ = auto()  # [BLOCK, BLOCK]
     RITZ_VECTORS = auto()  # [BLOCK, BLOCK]
+    RITZ_WORK = auto()  # [BLOCK]
     FULL = auto()  # [N, N]: for the full Jacobi
     FULL_VECTORS = auto()  # [N, N]
     SOLUTION = auto()  # [N, k]: null space, where CONVERGED
@@ -57,6 +56,8 @@ class Region(IntEnum):
     MOTION = auto()  # [Q]
     MOTION_COV = auto()  # [Q, Q]
     DIFFERENCE_COV = auto()  # [2, Q, Q]: of difference quotients of the motion along x and y
+    PATCH = auto()  # [PATCH_SIZE]: rays and surface of the patch (kernels.patch)
+    ROW = auto()  # [MAX_UNKNOWNS]: one equation's coefficients of all components
     DESIGN = auto()  # [M, Q]
     VALUE = auto()  # [M]
     LEFT_OUT = auto()  # [M]: standard size of what each equation leaves out
@@ -68,41 +69,50 @@ class Region(IntEnum):
     NORMAL = auto()  # [Q, Q]; from here on: sums over the sets of rows of the motion fit
     NORMAL_RHS = auto()  # [Q]
     NORMAL_SPREAD = auto()  # [3, Q, Q]: for the motion and its difference quotients along x and y, as the next two
-    LEFT = auto()  # [3, G + F, 9]: by the errors of the geometry, of the reference's normal equations
-    RIGHT = auto()  # [3, G + F, 9]: what is correlated with them
+    LEFT = auto()  # [3, G + F, Q]: by the errors of the geometry, of the reference's normal equations
+    RIGHT = auto()  # [3, G + F, Q]: what is correlated with them
     REFERENCE_VARIANCE = auto()  # [1]
+    OUT = auto()  # [n_maps]: what the maps get
 
 
 @dataclass(frozen=True)
 class Layout:
     """Offsets of the regions, in elements, for a model with ``n`` columns and ``k`` solutions.
 
-    ``rows_t`` and ``motion``: the largest numbers of motion rows and of equations of any camera.
+    ``moments``: planes of the largest tensor. ``rows_t`` and ``motion``: the largest numbers of motion rows and of
+    equations of any camera. ``unknowns`` of the motion fit; ``correlated``: columns whose noise cameras share;
+    ``maps``: output planes.
     """
 
     n: int
     k: int
+    moments: int
     rows_s: int
     rows_t: int
     terms: int
     motion: int
+    unknowns: int
+    correlated: int
+    maps: int
 
     @property
     def sizes(self) -> dict[Region, int]:
         """Number of elements of each region."""
-        n, k, terms, motion = self.n, self.k, self.terms, self.motion
-        s, t = self.rows_s, self.rows_t
+        n, k, terms, motion, q = self.n, self.k, self.terms, self.motion, self.unknowns
+        s, t, errors = self.rows_s, self.rows_t, self.terms + self.correlated
         flow = n - k
 
         def packed(m: int) -> int:
             return m * (m + 1) // 2
 
         return {
+            Region.MOMENTS: self.moments,
             Region.TENSOR: packed(n),
             Region.VECTORS: n * BLOCK,
             Region.IMAGES: n * BLOCK,
             Region.RITZ: BLOCK * BLOCK,
             Region.RITZ_VECTORS: BLOCK * BLOCK,
+            Region.RITZ_WORK: BLOCK,
             Region.FULL: n * n,
             Region.FULL_VECTORS: n * n,
             Region.SOLUTION: n * k,
@@ -127,22 +137,25 @@ class Layout:
             Region.GEOMETRY_CROSS: terms * t,
             Region.GEOMETRY_WORK: s * terms,
             Region.MOTION: MAX_UNKNOWNS,
-            Region.MOTION_COV: MAX_UNKNOWNS * MAX_UNKNOWNS,
-            Region.DIFFERENCE_COV: 2 * MAX_UNKNOWNS * MAX_UNKNOWNS,
-            Region.DESIGN: motion * MAX_UNKNOWNS,
+            Region.MOTION_COV: q * q,
+            Region.DIFFERENCE_COV: 2 * q * q,
+            Region.PATCH: PATCH_SIZE,
+            Region.ROW: MAX_UNKNOWNS,
+            Region.DESIGN: motion * q,
             Region.VALUE: motion,
             Region.LEFT_OUT: motion,
-            Region.WEIGHTED: motion * MAX_UNKNOWNS,
+            Region.WEIGHTED: motion * q,
             Region.OWN: packed(motion),
             Region.FACTOR: packed(motion),
             Region.DERIVATIVE: motion * terms,
-            Region.MOTION_WORK: max(motion * MAX_UNKNOWNS, packed(MAX_UNKNOWNS)),
-            Region.NORMAL: MAX_UNKNOWNS * MAX_UNKNOWNS,
-            Region.NORMAL_RHS: MAX_UNKNOWNS,
-            Region.NORMAL_SPREAD: 3 * MAX_UNKNOWNS * MAX_UNKNOWNS,
-            Region.LEFT: 3 * (terms + flow) * MAX_UNKNOWNS,
-            Region.RIGHT: 3 * (terms + flow) * MAX_UNKNOWNS,
+            Region.MOTION_WORK: max(motion * max(q, terms), packed(q)),
+            Region.NORMAL: q * q,
+            Region.NORMAL_RHS: q,
+            Region.NORMAL_SPREAD: 3 * q * q,
+            Region.LEFT: 3 * errors * q,
+            Region.RIGHT: 3 * errors * q,
             Region.REFERENCE_VARIANCE: 1,
+            Region.OUT: self.maps,
         }
 
     @property
@@ -163,6 +176,8 @@ class Number(IntEnum):
     N = len(Region)  # columns
     SOLUTIONS = auto()  # k
     FLOW = auto()  # F = N - k
+    FIRST_PLANE = auto()  # where the tensor begins among the planes of all tensors
+    BLOCK = auto()  # vectors of the block inverse iteration
     ITERATIONS = auto()  # of the block inverse iteration, per round
     MOTION_SOLUTION = auto()  # index of the solution along t, or -1
     TERMS = auto()  # G: geometry terms (1, x, y, t), 0 without a grid
@@ -187,20 +202,20 @@ class Number(IntEnum):
     OUT_Y = auto()
     STEP = auto()
     PITCH = auto()
-    EXTRA = auto()  # first J plane behind the tensor: window mass, energies
+    EXTRA = auto()  # first of the moments behind the tensor's: window mass, energies
     FLOW_ROWS = auto()  # 2: columns of the motion itself
     OFFSET_CODES = FLOW_ROWS + 2  # 6: offset of each motion row: 0 = "1", 1.. = AXES
     MOTION_ROWS = OFFSET_CODES + 6  # MAX_ROWS: columns of the motion rows
     CAMERA_ROWS = MOTION_ROWS + MAX_ROWS  # 2 x MAX_ROWS: columns of the geometry rows per camera solution
     CAMERA_AXIS = CAMERA_ROWS + 2 * MAX_ROWS  # 2: 0 for sx, 1 for sy
-    CROSS_AB = CAMERA_AXIS + 2  # 2 x 9 x 3: a, b, plane of J
+    CROSS_AB = CAMERA_AXIS + 2  # 2 x 9 x 3: a, b, moment
     BRIGHTNESS_PLANES = CROSS_AB + 54  # 4: output plane of each brightness row, from BRIGHTNESS_T on
     CENTRE = BRIGHTNESS_PLANES + 4  # MAX_SQUARES x 2: column of the constant, column of the square
     MOVE = CENTRE + 2 * MAX_SQUARES  # 2 x 2: columns of the flow's derivatives along x, y
     PARTNER = MOVE + 4  # MAX_COLUMNS: column of an own flow for each column of the reference model, or -1
     PLACE = PARTNER + MAX_COLUMNS  # MAX_UNKNOWNS: where each component of the motion stands among the unknowns, or -1
     LOWER = PLACE + MAX_UNKNOWNS  # N (N + 1) / 2: plane of each element of the lower triangle
-    # Behind them NOISE_TERMS x 2: element of the lower triangle, plane of J.
+    # Behind them NOISE_TERMS x 2: element of the lower triangle, moment.
 
 
 class Value(IntEnum):
@@ -233,45 +248,3 @@ class Value(IntEnum):
     PARTNER = CENTRE + MAX_SQUARES  # MAX_COLUMNS: factor of the noise shared with each column of the reference model
     DIFFERENCE = PARTNER + MAX_COLUMNS  # 2 x 7: by axis and offset code of a row; roots of sampling.difference_variance
     RATIO = DIFFERENCE + 14  # k x packed [F], then k x NOISE_TERMS
-
-
-@functools.cache
-def batch_kernel(spec: KernelSpec, body):
-    """A kernel: ``body(base, pixel, stride, n_pixels, which, number, value, J, ws, out)`` for every group of a batch.
-
-    ``base``: the group's place in the workspace; ``pixel``: its first pixel; ``stride``: distance of workspace
-    elements; ``which``: index of the solution that the stage is about, where that matters.
-    """
-    real, precise, lanes = spec.real, spec.precise, spec.lanes
-
-    @ti.kernel
-    def batch(
-        first_pixel: ti.i32,
-        n_pixels: ti.i32,
-        n_groups: ti.i32,
-        group_step: ti.i32,
-        stride: ti.i32,
-        which: ti.i32,
-        n_tasks: ti.i32,
-        number_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [Number.LOWER + N (N + 1) / 2 + 2 NOISE_TERMS]
-        value_in: ti.types.ndarray(dtype=precise, ndim=1),  # [Value.RATIO + k (F (F + 1) / 2 + NOISE_TERMS)]
-        J_in: ti.types.ndarray(dtype=real, ndim=1),  # [n_planes * n_pixels]
-        ws_io: ti.types.ndarray(dtype=precise, ndim=1),  # [n_groups * n_elements * lanes]
-        map_out: ti.types.ndarray(dtype=real, ndim=1),  # [n_maps * n_pixels]
-    ):
-        if ti.static(spec.gpu):
-            for g in range(n_groups):
-                body(
-                    g * group_step, first_pixel + g * lanes, stride, n_pixels, which,
-                    number_in, value_in, J_in, ws_io, map_out,
-                )  # fmt: skip
-        else:
-            for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
-                if part == 0:
-                    for g in range(task * n_groups // n_tasks, (task + 1) * n_groups // n_tasks):
-                        body(
-                            g * group_step, first_pixel + g * lanes, stride, n_pixels, which,
-                            number_in, value_in, J_in, ws_io, map_out,
-                        )  # fmt: skip
-
-    return batch

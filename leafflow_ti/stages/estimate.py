@@ -1,10 +1,10 @@
-"""Per-pixel stages: structure tensors of a band to named maps, batch by batch."""
+"""Per-pixel stages: structure tensors of a band to named maps, group by group of pixels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,10 +25,17 @@ from leafflow_ti.sampling import (
 )
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, OwnFlows, Problem
+from leafflow_ti.trace import span
 
-BATCH_BYTES = 8 << 20
-"""Workspace of one batch of pixels: it should stay in the processor's cache."""
+BATCH_BYTES = 16 << 20
+"""Workspace of one batch of pixels on the CPU where the steps are launched apart."""
+GPU_GROUPS = 1 << 15
+CHUNK_GROUPS = 2048
+"""Groups of a launch on the CPU: some tenths of a second, so that an interrupt is noticed."""
+TASKS_PER_THREAD = 4
 RIDGE = {"f64": 1e-13, "f32": 1e-7}
+GUARDED = {1: 2, 2: 4, 3: 4}
+"""Vectors that the inverse iteration carries for so many solutions; the guards are what makes it converge."""
 GAP = {"f64": 1e-6, "f32": 1e-3}
 DENOISE = {"ols": 0.0, "tls": 0.0, "tls-equilibrated": 0.9}
 """Share of the gradients' own noise that the covariances take out of J_ff; OLS divides by J_ff as it is, and the
@@ -47,7 +54,8 @@ mixed ones in proportion to the turning (a_s by .0026 of the above on a 60° fac
 Weights that know of the noise alone stake everything on the derivatives where images are good. That ``a_s`` and ``b_t``
 measure one derivative from the same noise, which the weights leave out, is one more reason for a share.
 """
-STEP_SIZE = {"f64": 1e-4, "f32": 1e-2}
+STEP_SIZE = {"f64": 1e-7, "f32": 3e-3}
+"""Relative step of the forward differences of the motion rows: about the root of the rounding."""
 MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
 """Least energy of the gradient relative to that of the image, (8 eps)²: below, it is the rounding of a constant."""
 MIN_MASS = 0.2
@@ -90,51 +98,80 @@ class View:
 
 @dataclass
 class _Tables:
-    """The tables of one data vector, on the host and on the device, and the tensor that belongs to them."""
+    """The tables of one data vector."""
 
     number: NDArray[np.int32]
     value: NDArray[np.float64]
-    on_device: tuple[Any, Any] = (None, None)
-    tensor: Any = None
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A stage, its argument, and which tables it works with; ``part``: "solve" or "fit"."""
+
+    stage: int
+    which: int
+    tables: int
+    part: str
 
 
 class EstimateStage:
     """Maps of ``Output`` planes [rows, pitch] from the packed tensors of ``TensorStage``.
 
     One tensor of the reference model, and one of each camera's own flow where the problem has them. ``differences``:
-    the covariances of the velocity's difference quotients are wanted, too; growth needs them.
+    the covariances of the velocity's difference quotients are wanted, too; growth needs them. ``apart``: the steps of
+    each part (solve, fit) are launched apart, as always on a GPU, so that their times can be told.
     """
 
-    def __init__(self, device: Device, problem: Problem, layout: TensorLayout, view: View, differences: bool = True):
+    def __init__(
+        self, device: Device, problem: Problem, layout: TensorLayout, view: View, differences: bool = True,
+        apart: bool = False,
+    ):  # fmt: skip
+        from leafflow_ti.kernels.maps import Output
+        from leafflow_ti.kernels.spec import EXTRA_PLANES
         from leafflow_ti.kernels.workspace import Layout
 
         self.device, self.problem, self.view, self.differences = device, problem, view, differences
+        self.apart = apart or device.gpu
         columns, own = problem.columns, problem.own_flows
         rows = self._rows()
         n_rows = [2 * len(problem.offsets) + problem.use_range] + ([2 * len(own.offsets)] if own else [])
+        planes = [len(layout.entries) + EXTRA_PLANES]
+        planes += [len(TensorLayout.of(own.columns).entries) + EXTRA_PLANES] * len(own.steps) if own else []
+        self._first_plane = np.cumsum([0, *planes]).tolist()
         self.layout = Layout(
-            columns.n, columns.n_time_like, len(rows.camera[0]) if rows.camera else 0, max(len(rows.motion), *n_rows),
-            len(problem.terms), max(n_rows),
+            columns.n, columns.n_time_like, max(planes), len(rows.camera[0]) if rows.camera else 0,
+            max(len(rows.motion), *n_rows), len(problem.terms), max(n_rows),
+            max(problem.fitted, problem.unknowns + bool(own and own.growth), 3 if problem.range_scale else 1),
+            columns.n_flow if own and own.reference_rows else 0, Output.PLANES,
         )  # fmt: skip
         self.reference = self._reference_tables(rows, layout)
-        self._all_tables = [self.reference]
+        self._tables_of = [self.reference]
         if own:
             # The same rows among all unknowns.
-            self._final = _Tables(self.reference.number.copy(), self.reference.value)
-            self._set_numbers(self._final.number, CORRELATED=columns.n_flow)
-            self._set_unknowns(self._final.number, own.unknowns, own.growth)
-            self._own = self._own_tables(own)
-            self._all_tables += [self._final, *self._own]
+            final = _Tables(self.reference.number.copy(), self.reference.value)
+            self._set_numbers(final.number, CORRELATED=columns.n_flow)
+            self._set_unknowns(final.number, own.unknowns, own.growth)
+            self._tables_of += [final, *self._own_tables(own)]
+        if problem.estimator == "tls":
+            # The null space in raw units; residuals and covariances on the equilibrated tensor.
+            self._raw = len(self._tables_of)
+            self._tables_of += [_Tables(t.number.copy(), self.unscaled(t.value)) for t in self._tables_of]
+        self._steps = self._make_steps()
         self.set_view(view)
-        lanes = device.dense.lanes
-        n_pixels = view.rows * view.pitch
+        lanes, n_pixels = device.dense.lanes, view.rows * view.pitch
+        self._row_groups = -(-view.cols // lanes)
         itemsize = np.dtype(device.real("algebra")).itemsize
         per_group = self.layout.n_elements * lanes * itemsize
-        self._groups = max(1, min(n_pixels // lanes, BATCH_BYTES // per_group if not device.gpu else 1 << 15))
-        self._batch_groups = 0
-        self._workspace = device.empty(self._groups * self.layout.n_elements * lanes, "algebra")
-        from leafflow_ti.kernels.maps import Output
-
+        groups = view.rows * self._row_groups
+        self._tasks = TASKS_PER_THREAD * device.threads
+        if device.gpu:
+            self._groups = min(groups, GPU_GROUPS)
+        elif self.apart:
+            self._groups = max(1, min(groups, BATCH_BYTES // per_group))
+        else:
+            self._groups = min(groups, CHUNK_GROUPS)
+        places = self._groups if self.apart else self._tasks
+        self._workspace = device.empty(places * self.layout.n_elements * lanes, "algebra")
         self._maps = device.empty(Output.PLANES * n_pixels)
 
     def _rows(self) -> SimpleNamespace:
@@ -186,6 +223,7 @@ class EstimateStage:
         number[: len(Region)] = self.layout.offsets
         self._set_numbers(
             number, N=columns.n, SOLUTIONS=columns.n_time_like, FLOW=columns.n_flow, ITERATIONS=problem.iterations,
+            BLOCK=GUARDED[columns.n_time_like], FIRST_PLANE=0,
             MOTION_SOLUTION=columns.n_time_like - 1 if "t" in columns.solutions else -1, TERMS=len(problem.terms),
             OFFSETS=len(offsets), ROWS_T=len(rows), ROWS_S=0, USE_RANGE=0, UNKNOWNS=0, WEIGHTED=problem.weighted,
             BRIGHTNESS_COLUMN=-1, BRIGHTNESS_ROWS=0, WORLD_MAPS=0, RANGE_TERM=-1, CAMERA_SOLUTIONS=0, CROSS_TERMS=0,
@@ -266,8 +304,9 @@ class EstimateStage:
         moves = [own.columns.index(c, o) for c in ("x", "y") for o in ("x", "y")]
         common.number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
         found = []
-        for step in own.steps:
+        for step, first_plane in zip(own.steps, self._first_plane[1:-1], strict=True):
             number, value = common.number.copy(), common.value.copy()
+            number[Number.FIRST_PLANE] = first_plane
             value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
             for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
                 number[Number.PARTNER + a] = partner
@@ -286,14 +325,22 @@ class EstimateStage:
             difference_variance(self.problem.sampling.axis(axis), 2 * view.step, int(offset == axis))
             for axis in ("x", "y") for offset in ("1", *AXES, "range")
         ])  # fmt: skip
-        for tables in self._all_tables:
+        for tables in self._tables_of:
             self._set_numbers(tables.number, OUT_X=view.x, OUT_Y=view.y, STEP=view.step, PITCH=view.pitch)
             value = tables.value
             value[Value.F], value[Value.PX], value[Value.PY] = view.f_px, *view.principal_px
             value[Value.BASELINE : Value.BASELINE + 2] = view.baseline_mm
             value[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
             value[Value.DIFFERENCE : Value.DIFFERENCE + 14] = factors
-            tables.on_device = (self.device.array(tables.number, "int"), self.device.array(value, "algebra"))
+        numbers, values = (np.cumsum([0, *map(len, parts)]) for parts in (
+            [t.number for t in self._tables_of], [t.value for t in self._tables_of]
+        ))  # fmt: skip
+        self._on_device = (
+            self.device.array([n for s in self._steps for n in (s.stage, s.which, numbers[s.tables], values[s.tables])],
+                              "int"),
+            self.device.array(np.concatenate([t.number for t in self._tables_of]), "int"),
+            self.device.array(np.concatenate([t.value for t in self._tables_of]), "algebra"),
+        )  # fmt: skip
 
     @staticmethod
     def unscaled(value: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -304,81 +351,96 @@ class EstimateStage:
         raw[Value.SCALE : Value.SCALE + MAX_COLUMNS] = 1.0
         return raw
 
-    def unsolved(self) -> bool:
-        """Whether pixels of the present batch have no null space yet; on a GPU always, a look would cost more."""
-        if self.device.gpu:
-            return True
-        from leafflow_ti.kernels.workspace import Region
+    def _make_steps(self) -> list[_Step]:
+        """What is done to every group of pixels."""
+        from leafflow_ti.kernels.patch_fit import CLEAR, COVARIANCE, DIFFERENCES, FINISH, START
+        from leafflow_ti.kernels.stages import Stage
 
-        shape = (-1, self.layout.n_elements, self.device.dense.lanes)
-        solved = self._workspace.reshape(shape)[: self._batch_groups, self.layout.offsets[Region.CONVERGED]]
-        return bool((solved < 0.5).any())
+        problem, own = self.problem, self.problem.own_flows
+        steps: list[_Step] = []
+
+        def add(stage: Stage, which: int = 0, tables: int = 0) -> None:
+            steps.append(_Step(stage, which, tables, "solve" if stage <= Stage.ROW_COVARIANCE else "fit"))
+
+        def solve(tables: int) -> None:
+            for stage, raw in ESTIMATORS[problem.estimator](problem.solver):
+                add(stage, tables=tables + self._raw if raw else tables)
+            add(Stage.CLEAN, tables=tables)
+
+        errors = COVARIANCE | (DIFFERENCES if self.differences else 0)
+        solve(0)
+        if "t" in problem.columns.solutions:
+            add(Stage.ROW_COVARIANCE, problem.columns.n_time_like - 1)
+        for camera in range(len(problem.camera_axes)):
+            add(Stage.ROW_COVARIANCE, camera)
+            add(Stage.ADD_CAMERA, camera)
+        if problem.camera_axes:
+            add(Stage.GEOMETRY)
+        if problem.range_scale is not None:
+            add(Stage.RANGE_MOTION)
+        elif problem.fitted:
+            for i in range(problem.passes):
+                last = i == problem.passes - 1 and not own
+                add(Stage.PATCH_FIT, (START if i == 0 else CLEAR) | FINISH | (errors if last else 0))
+        add(Stage.MEASURED)
+        if own:
+            if own.reference_rows:
+                add(Stage.PATCH_FIT, CLEAR | errors, 1)
+            for i in range(len(own.steps)):
+                solve(2 + i)
+                add(Stage.ROW_COVARIANCE, 0, 2 + i)
+                clear = CLEAR if i == 0 and not own.reference_rows else 0
+                finish = FINISH if i == len(own.steps) - 1 else 0
+                add(Stage.PATCH_FIT, clear | errors | finish, 2 + i)
+        if problem.unknowns:
+            add(Stage.MOTION, tables=1 if own else 0)
+        add(Stage.EMIT)
+        return steps
+
+    def _launches(self) -> list[tuple[Any, int, int, str]]:
+        """Kernel, first step, end, and part of what is launched for a batch."""
+        from leafflow_ti.kernels.stages import Stage, stage_kernel
+
+        spec, steps = self.device.dense, self._steps
+        if self.device.gpu:
+            return [(stage_kernel(spec, Stage(s.stage)), i, i + 1, s.part) for i, s in enumerate(steps)]
+        kernel = stage_kernel(spec)
+        if not self.apart:
+            return [(kernel, 0, len(steps), "estimate")]
+        runs, first = [], 0
+        for part, run in groupby(steps, lambda s: s.part):
+            end = first + len(list(run))
+            runs.append((kernel, first, end, part))
+            first = end
+        return runs
 
     def __call__(self, tensor: Any, own_tensors: Sequence[Any] = ()) -> NDArray[Any]:
         """The planes of ``Output`` as a NumPy array [planes, rows, cols]."""
-        from leafflow_ti.kernels.covariance import covariance_kernels
-        from leafflow_ti.kernels.maps import Output, maps_kernels
-        from leafflow_ti.kernels.patch_fit import CLEAR, DIFFERENCES, FINISH, START, patch_fit_kernel
-        from leafflow_ti.kernels.range_motion import range_motion_kernel
+        from leafflow_ti.kernels.maps import Output
 
-        device, view, problem, own = self.device, self.view, self.problem, self.problem.own_flows
-        lanes = device.dense.lanes
+        device, view, lanes = self.device, self.view, self.device.dense.lanes
         n_pixels = view.rows * view.pitch
-        self.reference.tensor = tensor
-        if own:
-            self._final.tensor = tensor
-            for tables, one in zip(self._own, own_tensors, strict=True):
-                tables.tensor = one
-        covariance, maps = covariance_kernels(device.dense), maps_kernels(device.dense)
-        differences = DIFFERENCES if self.differences else 0
-        for first in range(0, n_pixels // lanes, self._groups):
-            groups = min(self._groups, n_pixels // lanes - first)
-            step, stride = (self.layout.n_elements * lanes, lanes) if not device.gpu else (1, groups)
-
-            def launch(
-                kernel: Any, tables: _Tables = self.reference, *, which: int = 0, value: Any = None,
-                at: Any = (first, groups, step, stride),
-            ) -> None:  # fmt: skip
-                first, groups, step, stride = at
-                kernel(
-                    first * lanes, n_pixels, groups, step, stride, which, device.tasks(groups), tables.on_device[0],
-                    tables.on_device[1] if value is None else value, tables.tensor, self._workspace, self._maps,
-                )  # fmt: skip
-
-            def flow_of(tables: _Tables, solution: int) -> None:
-                """Parameters of one data vector; covariance of its rows along t."""
-                ESTIMATORS[problem.estimator](self, tables)(partial(launch, tables=tables))
-                launch(covariance.row_covariance, tables, which=solution)
-
-            self._batch_groups = groups
-            moving = "t" in problem.columns.solutions
-            if moving:
-                flow_of(self.reference, problem.columns.n_time_like - 1)
-            else:
-                ESTIMATORS[problem.estimator](self, self.reference)(launch)
-            for camera in range(len(problem.camera_axes)):
-                launch(covariance.row_covariance, which=camera)
-                launch(covariance.add_camera, which=camera)
-            if problem.camera_axes:
-                launch(covariance.geometry)
-            if problem.range_scale is not None:
-                launch(range_motion_kernel(device.dense))
-            elif problem.fitted:
-                fit = patch_fit_kernel(device.dense)
-                for i in range(problem.passes):
-                    last = i == problem.passes - 1 and not own
-                    launch(fit, which=(START if i == 0 else CLEAR) | FINISH | (differences if last else 0))
-            launch(maps.measured)
-            if own:
-                if own.reference_rows:
-                    launch(fit, self._final, which=CLEAR | differences)
-                for i, tables in enumerate(self._own):
-                    flow_of(tables, 0)
-                    clear = CLEAR if i == 0 and not own.reference_rows else 0
-                    finish = FINISH if i == len(self._own) - 1 else 0
-                    launch(fit, tables, which=clear | differences | finish)
-            if problem.unknowns:
-                launch(maps.motion, self._final if own else self.reference)
+        tensors = self._together([tensor, *own_tensors], n_pixels)
+        workspace = device.vectors(self._workspace, lanes)
+        task_step, group_step = (0, self.layout.n_elements) if self.apart else (self.layout.n_elements, 0)
+        n_groups = view.rows * self._row_groups
+        for first in range(0, n_groups, self._groups):
+            groups = min(self._groups, n_groups - first)
+            for kernel, begin, end, part in self._launches():
+                with span(part):
+                    kernel(
+                        first, groups, task_step, group_step, self._row_groups, view.pitch, n_pixels, begin, end,
+                        min(groups, self._tasks), *self._on_device, tensors, workspace, self._maps,
+                    )  # fmt: skip
         planes = device.host(self._maps).reshape(Output.PLANES, view.rows, view.pitch)
         result: NDArray[Any] = planes[:, :, : view.cols]
         return result
+
+    def _together(self, tensors: Sequence[Any], n_pixels: int) -> Any:
+        """All tensors in one array, where the tables' FIRST_PLANE says."""
+        if len(tensors) == 1:
+            return tensors[0]
+        planes = np.diff(self._first_plane)
+        return self.device.array(
+            np.concatenate([self.device.host(t)[: n * n_pixels] for t, n in zip(tensors, planes, strict=True)])
+        )

@@ -21,6 +21,7 @@ from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.planes import Filtering, Terms, round_up
+from leafflow_ti.trace import span
 
 EXTRA_PLANES = 4
 """Behind the tensor's entries: window mass, energies of the gradient, of it smoothed once more, of the image."""
@@ -354,6 +355,17 @@ class TensorStage:
         ``valid`` [in_rows, in_cols]: pixels at which every camera has a finite grey value inside its image;
         ``factors`` [FACTOR_PLANES, in_rows, in_cols]: what derived channels are multiplied by.
         """
+        with span("filter"):
+            if not self._add_frame(block, valid, factors):
+                return None
+        with span("tensor"):
+            self._sums[(self._n_maps - 1) % self.sampling.t.size](self._maps, self._summed)
+            self._along_y(self._summed, self._tall)
+            self._along_x(self._tall, self.tensor)
+        return self.tensor
+
+    def _add_frame(self, block: NDArray[Any], valid: NDArray[np.bool_], factors: NDArray[Any] | None) -> bool:
+        """Filter the next frame into its maps; whether the window is full."""
         frame = np.zeros((*self.cameras, self.band.in_rows, self.pitch), self.device.real("storage"))
         frame[..., : self.band.in_cols] = block
         self.device.write(self._raw, self._pushed % self.n_taps * self._frame_size, frame)
@@ -363,14 +375,9 @@ class TensorStage:
             self._factors.append(np.asarray(factors, frame.dtype))
         self._pushed += 1
         if self._pushed < self.n_taps:
-            return None
+            return False
         self._make_maps()
-        if self._n_maps < self.sampling.t.size:
-            return None
-        self._sums[(self._n_maps - 1) % self.sampling.t.size](self._maps, self._summed)
-        self._along_y(self._summed, self._tall)
-        self._along_x(self._tall, self.tensor)
-        return self.tensor
+        return self._n_maps >= self.sampling.t.size
 
     def _make_maps(self) -> None:
         from leafflow_ti.kernels.planes import sum_products_kernel

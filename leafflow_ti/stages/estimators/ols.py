@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 
-def ols(stage: Any, tables: Any) -> Callable[[Callable[..., None]], None]:
+def ols(solver: str) -> list[tuple[Any, bool]]:
     """``J_ff p = -J_f,time`` for every solution, by one Cholesky factor."""
-    from leafflow_ti.kernels.null_space import null_space_kernels
+    from leafflow_ti.kernels.stages import Stage
 
-    kernels = null_space_kernels(stage.device.dense)
-
-    def solve(launch: Callable[..., None]) -> None:
-        launch(kernels.load)
-        launch(kernels.least_squares)
-        launch(kernels.accept)
-        launch(kernels.parameters)
-        launch(kernels.residuals)
-        launch(kernels.centre)
-
-    return solve
+    stages = (
+        Stage.LOAD, Stage.SCALE, Stage.FACTORISE, Stage.LEAST_SQUARES, Stage.ACCEPT, Stage.PARAMETERS,
+        Stage.RESIDUALS, Stage.CENTRE,
+    )  # fmt: skip
+    return [(stage, False) for stage in stages]

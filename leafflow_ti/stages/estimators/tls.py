@@ -7,41 +7,26 @@ a full cyclic Jacobi.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-Solve = Callable[[Callable[..., None]], None]
 
-
-def tls_equilibrated(stage: Any, tables: Any) -> Solve:
+def tls_equilibrated(solver: str) -> list[tuple[Any, bool]]:
     """The k smallest eigenvectors of ``C^-1/2 J C^-1/2``."""
-    return _null_space(stage, None)
+    return _null_space(solver, False)
 
 
-def tls(stage: Any, tables: Any) -> Solve:
+def tls(solver: str) -> list[tuple[Any, bool]]:
     """The k smallest eigenvectors of J itself; depends on the units of the columns (section 2.3.3)."""
-    return _null_space(stage, stage.device.array(stage.unscaled(tables.value), "algebra"))
+    return _null_space(solver, True)
 
 
-def _null_space(stage: Any, value: Any) -> Solve:
-    from leafflow_ti.kernels.null_space import null_space_kernels
+def _null_space(solver: str, raw: bool) -> list[tuple[Any, bool]]:
+    from leafflow_ti.kernels.stages import Stage
 
-    kernels = null_space_kernels(stage.device.dense)
-
-    def solve(launch: Callable[..., None]) -> None:
-        launch(kernels.load, value=value)
-        launch(kernels.least_squares, value=value)
-        if stage.problem.solver == "fast":
-            launch(kernels.inverse_iteration, value=value)
-        if stage.unsolved():
-            # All pixels, or those whose gap is too small for the iteration.
-            launch(kernels.jacobi, value=value)
-        launch(kernels.parameters, value=value)
-        if value is not None:
-            # Residuals and covariances are worked out on the equilibrated tensor.
-            launch(kernels.load)
-            launch(kernels.factorise)
-        launch(kernels.residuals)
-        launch(kernels.centre)
-
-    return solve
+    # Jacobi takes all pixels, or those whose gap is too small for the iteration.
+    fast = [Stage.INVERSE_ITERATION] if solver == "fast" else []
+    search = [Stage.SCALE, Stage.FACTORISE, Stage.LEAST_SQUARES, *fast, Stage.JACOBI, Stage.PARAMETERS]
+    # Residuals and covariances are worked out on the equilibrated tensor.
+    again = [Stage.SCALE, Stage.FACTORISE] if raw else []
+    steps = [(Stage.LOAD, False), *((stage, raw) for stage in search)]
+    return steps + [(stage, False) for stage in (*again, Stage.RESIDUALS, Stage.CENTRE)]

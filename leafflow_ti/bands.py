@@ -1,0 +1,92 @@
+"""How high the bands of a run are, and the memory that one takes: arrays, frames read ahead, units not yet written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from leafflow_ti.config import RunConfig
+from leafflow_ti.errors import ConfigError
+from leafflow_ti.filters import gaussian_radius
+from leafflow_ti.models import TensorLayout
+from leafflow_ti.range_plan import RangePlan
+from leafflow_ti.stages.prefilter import prefilter_bytes
+from leafflow_ti.stages.problem import Problem
+from leafflow_ti.stages.tensor import Band, band_bytes
+
+BAND_PIXELS = 1 << 17
+"""Output pixels of a unit where memory allows: large enough to amortise halos, small enough to answer an interrupt."""
+READ_AHEAD = 2
+"""Frames read before they are needed, where memory allows: one is decoded while the other is ready."""
+WRITE_BEHIND = 2
+"""Finished units that may wait to be written, beside the one that is being written."""
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What decides the memory of a unit. ``cols``: output columns; ``n_cameras`` are read, ``n_maps`` written."""
+
+    config: RunConfig
+    problem: Problem
+    layout: TensorLayout
+    ranges: RangePlan | None
+    n_cameras: int
+    n_maps: int
+    cols: int
+
+    def bytes(self, rows: int, ahead: int) -> int:
+        """Memory for units of ``rows`` rows while ``ahead`` frames are read ahead."""
+        config, problem, ranges = self.config, self.problem, self.ranges
+        itemsize = 4 if config.precision == "f32" else 8
+        # Two more rows and columns for the growth at the edges.
+        band = Band.of(problem.sampling, rows + 2, self.cols + 2, config.window.stride)
+        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize)
+        read = band
+        if ranges and ranges.depth and ranges.layout:
+            depth = ranges.depth
+            read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
+            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize)
+        own = problem.own_flows
+        if own:
+            one = band_bytes(own.columns, TensorLayout.of(own.columns), own.sampling, band, itemsize)
+            total += len(own.steps) * one
+        margin = 0
+        if config.filters.prefilter != "none":
+            margin = gaussian_radius(config.filters.sigma_pre)
+            total += prefilter_bytes(config.filters.sigma_pre, self.n_cameras, read.in_rows, read.in_cols, itemsize)
+        # Grey values, and one byte that says whether each is finite.
+        block = self.n_cameras * (read.in_rows + 2 * margin) * (read.in_cols + 2 * margin) * (itemsize + 1)
+        unit = rows * self.cols * (4 * self.n_maps + 1)
+        # One frame and one unit are worked on, and one unit is being written.
+        return total + (1 + ahead) * block + (2 + WRITE_BEHIND) * unit
+
+
+def usable_memory(config: RunConfig) -> int:
+    """Bytes of the limit that arrays may take; the rest is the interpreter's, the engine's and the results'."""
+    return int(0.8 * config.plan.max_memory)
+
+
+def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int, int, int]:
+    """Rows of a unit of ``rows`` output rows, its memory, and the first of ``depths`` to read ahead that fits.
+
+    Raises ConfigError when nothing fits.
+    """
+    plan, limit = demand.config.plan, usable_memory(demand.config)
+    for ahead in depths:
+        if plan.tile != "auto":
+            chosen = min(int(plan.tile), rows)
+        else:
+            chosen = int(np.clip(BAND_PIXELS // demand.cols, 16, rows)) if rows > 16 else rows
+            while chosen > 1 and demand.bytes(chosen, ahead) > limit:
+                chosen = max(1, chosen * 3 // 4)
+            # Bands of equal height: the last one should not be a sliver.
+            chosen = -(-rows // -(-rows // chosen))
+        needed = demand.bytes(chosen, ahead)
+        if needed <= limit:
+            return chosen, needed, ahead
+    raise ConfigError(
+        f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB, 80 % of plan.max_memory are "
+        f"{limit / 2**20:.0f} MiB: raise it, lower plan.tile, or use a stride, a roi, a smaller window"
+    )

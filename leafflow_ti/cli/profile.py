@@ -1,0 +1,108 @@
+"""``profile``: what a run costs on this machine, stage by stage, and how long the whole will take."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from leafflow_ti.cli import options
+from leafflow_ti.cli.progress import format_duration, format_rate
+from leafflow_ti.errors import UsageError
+from leafflow_ti.trace import BACKGROUND_STAGES, STAGES
+
+if TYPE_CHECKING:
+    from leafflow_ti.profiling import Profile, StageCost
+
+
+@options.with_settings(without=("frames",))
+def profile(
+    settings: Callable[..., Any],
+    capture: Annotated[
+        Path | None, typer.Argument(metavar="[CAPTURE]", help="capture.toml, or the folder that holds it.")
+    ] = None,
+    case: Annotated[
+        str | None,
+        typer.Option(
+            "--case",
+            metavar="NAME",
+            help="A built-in synthetic capture instead: affine-4d, affine-4d-stride4, affine-scene-flow, depth.",
+            show_default=False,
+        ),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", metavar="N", min=1, help="Frames to measure.")] = 5,
+    trace: Annotated[
+        Path | None,
+        typer.Option(
+            "--trace", metavar="FILE", help="Write a trace for Perfetto or about:tracing.", show_default=False
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Measure the stages of a run on a few frames, and say how long the whole will take.
+
+    Takes the options of run; the frames of the whole are those of --set output.frames=A:B. Nothing is written but FILE.
+    """
+    if (capture is None) == (case is None):
+        raise UsageError("one capture is profiled: give CAPTURE or --case NAME")
+    if capture is not None:
+        configuration = settings()
+        from leafflow_ti.capture import open_capture
+
+        opened: Any = open_capture(capture)
+    else:
+        from leafflow_ti.profile_cases import find_case
+
+        chosen = find_case(str(case))
+        configuration = settings(*chosen.settings)
+        opened = chosen.capture(frames)
+
+    from leafflow_ti.profiling import profile as measure
+
+    found = measure(opened, configuration, frames, trace)
+    typer.echo(json.dumps(found.to_json(), indent=2) if as_json else "\n".join(format_profile(found)))
+
+
+def format_profile(found: Profile) -> list[str]:
+    """The stages as a table, then the whole."""
+    ceilings, whole = found.ceilings, found.prediction
+    peak = "" if found.peak_bytes is None else f", peak of the process {found.peak_bytes / 2**20:.0f} MiB"
+    overlap = "" if found.overlap is None else f", {found.overlap:.0%} of it hidden behind the computing"
+    return [
+        f"model       {found.model}",
+        f"device      {found.device}; compiling or loading the kernels: {found.compile_seconds:.1f} s",
+        f"ceilings    {ceilings.gflops_f32:.0f} GFLOP/s f32, {ceilings.gflops_f64:.0f} GFLOP/s f64, "
+        f"{ceilings.gbytes:.1f} GB/s from memory",
+        f"measured    {found.frames_measured} units of {found.unit[0]} x {found.unit[1]} pixels, "
+        f"after {found.fill_seconds:.2f} s to fill the windows",
+        "",
+        f"{'stage':<10} {'ms/unit':>9} {'us/px':>8} {'of time':>8} {'GFLOP/s':>8} {'of peak':>8} {'GB/s':>7} "
+        f"{'of peak':>8}  limit",
+        *(_row(cost) for cost in found.stages),
+        f"{'unit':<10} {1e3 * found.seconds_per_unit:9.1f} "
+        f"{1e6 / found.pixels_per_second:8.3f} {1:8.0%}{'':36}  {found.limit}",
+        "",
+        *(f"{c.stage:<10} {STAGES[c.stage]}" for c in found.stages),
+        "",
+        f"Read, decode and write go on beside the computing: what they cost alone{overlap}.",
+        f"speed       {format_rate(found.pixels_per_second)}, limited by {found.limit}",
+        f"memory      {found.planned_bytes / 2**20:.0f} MiB planned{peak}",
+        f"whole       {whole.units} units ({whole.frames} frames x {whole.bands} bands, {whole.frames_read} frames "
+        f"read): about {format_duration(whole.seconds)}",
+        "            = compiling + for every band: filling the windows + frames x unit, by rows",
+    ]
+
+
+def _row(cost: StageCost) -> str:
+    def number(value: float | None, form: str, width: int) -> str:
+        return f"{'' if value is None else format(value, form):>{width}}"
+
+    name = f"({cost.stage})" if cost.stage in BACKGROUND_STAGES else cost.stage
+    return (
+        f"{name:<10} {1e3 * cost.seconds:9.1f} {cost.us_per_pixel:8.3f} {cost.share:8.0%} "
+        f"{number(cost.gflops, '.1f', 8)} {number(cost.share_of_flops, '.1%', 8)} {number(cost.gbytes, '.2f', 7)} "
+        f"{number(cost.share_of_bytes, '.1%', 8)}  {cost.limit}"
+    )

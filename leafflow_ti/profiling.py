@@ -1,0 +1,287 @@
+"""What a run of a capture costs on this device, stage by stage, what limits it, and how long the whole will take."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.api import create_store, start_device
+from leafflow_ti.background import Behind
+from leafflow_ti.bands import WRITE_BEHIND
+from leafflow_ti.capture import Capture
+from leafflow_ti.ceilings import Ceilings, measure_ceilings
+from leafflow_ti.config import RunConfig
+from leafflow_ti.errors import ConfigError
+from leafflow_ti.pipeline import Maps, Pipeline
+from leafflow_ti.plan import Plan, Unit, make_plan
+from leafflow_ti.results import ResultStore
+from leafflow_ti.sampling import Sampling
+from leafflow_ti.stages.tensor import Band
+from leafflow_ti.trace import BACKGROUND_STAGES, STAGES, Event, Trace, active, span
+from leafflow_ti.work import Rate, count_work, rate
+
+ALONE_FRAMES = 3
+"""Frames read, and times a unit is written, to see what that costs by itself."""
+WAITING_SHARE = 0.2
+"""Share of the time that computing waits above which reading or writing is what limits."""
+LAUNCH_SHARE = 0.5
+"""Share of a stage's time that it takes for a single pixel, too, above which launches are what limits."""
+
+Result = tuple[Unit, Maps, NDArray[np.uint8]]
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """One stage for one unit in the middle of a sequence.
+
+    ``seconds``; ``us_per_pixel`` of the unit; ``share`` of the time on the clock (stages beside the computing may hide
+    behind it). ``gflops`` [10^9/s], ``gbytes`` [10^9 bytes/s] of the work that the stage must do, and their shares of
+    what the machine can do, where that is counted. ``limit``: "launches" where a single pixel takes half as long, else
+    the ceiling that is nearer, "compute" or "memory"; "disk" or "decoding" beside the computing.
+    """
+
+    stage: str
+    seconds: float
+    us_per_pixel: float
+    share: float
+    limit: str
+    gflops: float | None = None
+    gbytes: float | None = None
+    share_of_flops: float | None = None
+    share_of_bytes: float | None = None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The whole run: ``frames`` of output, each in ``bands``, together ``units``; ``seconds``: with compiling.
+
+    ``frames_read``: blocks of images that are read and filtered, those that fill the windows of each band included.
+    """
+
+    frames: int
+    bands: int
+    units: int
+    frames_read: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What was measured. ``unit``: rows and columns of output pixels; ``seconds_per_unit`` on the clock, in the middle
+    of a sequence; ``fill_seconds``: for the frames that fill the windows before the first unit; ``overlap``: share of
+    reading, decoding and writing that computing does not wait for, None where they cost nothing; ``planned_bytes`` of
+    the arrays, ``peak_bytes`` of the process, measurement included (None where the system does not tell).
+    """
+
+    model: str
+    device: str
+    unit: tuple[int, int]
+    frames_measured: int
+    compile_seconds: float
+    seconds_per_unit: float
+    pixels_per_second: float
+    fill_seconds: float
+    stages: tuple[StageCost, ...]
+    limit: str
+    overlap: float | None
+    planned_bytes: int
+    peak_bytes: int | None
+    ceilings: Ceilings
+    prediction: Prediction
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values; what is not known is null."""
+        found: dict[str, Any] = _without_nan(asdict(self))
+        return found
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """The computing thread in the frames of a sequence: seconds until the first unit (``fill``), of each unit, and of
+    each stage and kind of waiting per unit."""
+
+    fill: float
+    units: tuple[float, ...]
+    stages: dict[str, float]
+    waits: dict[str, float]
+
+    @classmethod
+    def of(cls, events: list[Event], fill: int) -> _Steps:
+        """From the spans of a traced sequence whose first ``fill`` frames only fill the windows."""
+        steps = sorted((e for e in events if e.stage == "host"), key=lambda e: e.start)
+        full = steps[fill:]
+        first, end = full[0].start, full[-1].start + full[-1].duration
+        stages: dict[str, float] = {}
+        waits: dict[str, float] = {}
+        for e in events:
+            if e.thread == full[0].thread and first <= e.start < end:
+                into, key = (waits, e.label) if e.stage == "wait" else (stages, e.stage)
+                into[key] = into.get(key, 0.0) + e.own / 1e9 / len(full)
+        starts = [e.start for e in full] + [end]
+        units = tuple((b - a) / 1e9 for a, b in itertools.pairwise(starts))
+        return cls((first - steps[0].start) / 1e9, units, stages, waits)
+
+
+def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Path | None = None) -> Profile:
+    """Measure the first ``frames`` units of the highest band of a run, after compiling.
+
+    ``trace_file``: where the spans of that go (see ``Trace.write``). Nothing else is left behind: units are written to
+    a temporary folder. Raises as ``run`` does, ConfigError where no pixel can be measured, RunError where
+    ``trace_file`` cannot be written.
+    """
+    plan = make_plan(capture, config)
+    device = start_device(config)
+    trace = Trace(keep=True, barrier=device.synchronize)
+    if trace_file is not None:
+        trace.write(trace_file)  # better refused now than after the work
+    capture.keep_decoded(plan.cache_bytes)
+    pipeline = Pipeline(plan, capture, device, trace)
+    band = max(range(plan.bands), key=lambda b: _height(pipeline.extent(b)))
+    rows, cols = pipeline.extent(band)
+    if not _height((rows, cols)):
+        raise ConfigError("no pixel can be measured: the window reaches beyond the images everywhere: make it smaller")
+    compiling = pipeline.warm_up()
+    least = pipeline.least_seconds()
+    latency = plan.problem.sampling.t.radius
+    last = plan.frames[-1] + latency + 1
+    alone = range(max(plan.frames[0] - latency, last - ALONE_FRAMES), last)
+    background = {s: n / len(alone) for s, n in pipeline.read_alone(band, alone).items()}
+    measured = min(frames, len(plan.frames))
+    background["write"] = _run_units(pipeline, band, measured)
+    if trace_file is not None:
+        trace.write(trace_file)
+    steps = _Steps.of(trace.events or [], 2 * latency)
+    seconds = statistics.median(steps.units)
+    pixels = (plan.band(band).stop - plan.band(band).start) * len(plan.x)
+    ceilings = measure_ceilings(device)
+    computed = (rows.stop - rows.start) * (cols.stop - cols.start)
+    work = {stage: one * computed for stage, one in count_work(plan).items()}
+    spent = {**steps.stages, **background}
+    reached = {
+        s: rate(s, one, spent[s], ceilings, device.storage, device.algebra)
+        for s, one in work.items()
+        if spent.get(s, 0.0) > 0.0
+    }
+    stages = tuple(_cost(s, spent[s], seconds, pixels, reached.get(s), least.get(s, 0.0)) for s in STAGES if s in spent)
+    return Profile(
+        plan.model, str(device), (pixels // len(plan.x), len(plan.x)), measured, compiling, seconds, pixels / seconds,
+        steps.fill, stages, _limit(stages, steps.waits, seconds), _overlap(background, steps.waits), plan.bytes,
+        _peak_bytes(), ceilings, predict(pipeline, band, steps.fill, seconds, steps.stages, compiling),
+    )  # fmt: skip
+
+
+def predict(
+    pipeline: Pipeline, band: int, fill: float, unit: float, stages: Mapping[str, float], compiling: float
+) -> Prediction:
+    """The whole run from one band: every band fills its windows once, then gives a unit per frame.
+
+    ``fill``, ``unit``: seconds of the two, waiting included; ``stages``: of a unit. Filling and filters grow with the
+    rows of images, the rest with the rows of output that are computed; a band that is all border costs nothing.
+    """
+    plan, latency = pipeline.plan, pipeline.plan.problem.sampling.t.radius
+    filters = sum(stages.get(s, 0.0) for s in ("prefilter", "filter"))
+    n = len(plan.frames)
+    seconds, read = compiling, 0
+    high = _height(pipeline.extent(band))
+    for b in range(plan.bands):
+        rows = _height(pipeline.extent(b))
+        if rows:
+            wide = _image_rows(plan.problem.sampling, rows, plan) / _image_rows(plan.problem.sampling, high, plan)
+            seconds += wide * (fill + n * filters) + n * (unit - filters) * rows / high
+            read += n + 2 * latency
+    return Prediction(n, plan.bands, plan.n_units, read, seconds)
+
+
+def _height(extent: tuple[slice, slice]) -> int:
+    """Rows of a rectangle, 0 if it has no columns."""
+    rows, cols = extent
+    return rows.stop - rows.start if cols.stop > cols.start else 0
+
+
+def _image_rows(sampling: Sampling, rows: int, plan: Plan) -> int:
+    """Rows of images that so many rows of output need."""
+    return Band.of(sampling, rows, 1, plan.x.step).in_rows
+
+
+def _run_units(pipeline: Pipeline, band: int, frames: int) -> float:
+    """Compute and write the first units of a band; seconds of writing one while nothing else goes on."""
+    plan = pipeline.plan
+    wanted = {plan.unit(t, band).index for t in range(frames)}
+    last: list[Result] = []
+    with tempfile.TemporaryDirectory(prefix="leafflow-ti-profile-") as folder:
+        store = create_store(Path(folder) / "out.zarr", plan, {})
+
+        def write(result: Result) -> None:
+            last[:] = [result]
+            with span("write", f"unit {result[0].index}"):
+                _write(store, result)
+
+        with active(pipeline.trace), Behind(write, WRITE_BEHIND) as writer:
+            pipeline.run(set(range(plan.n_units)) - wanted, lambda *result: writer.put(result))
+        return statistics.median(_seconds_of_writing(store, last[0]))
+
+
+def _seconds_of_writing(store: ResultStore, result: Result) -> Iterator[float]:
+    for _ in range(ALONE_FRAMES):
+        began = time.perf_counter()
+        _write(store, result)
+        yield time.perf_counter() - began
+
+
+def _write(store: ResultStore, result: Result) -> None:
+    unit, maps, status = result
+    store.write_unit(unit.index, unit.t_index, unit.rows, maps, status)
+
+
+def _cost(stage: str, seconds: float, clock: float, pixels: int, reached: Rate | None, least: float) -> StageCost:
+    limit = {"read": "disk", "write": "disk", "decode": "decoding", "prefilter": "compute"}.get(stage, "")
+    us, share = seconds / pixels * 1e6, seconds / clock
+    if reached is None:
+        return StageCost(stage, seconds, us, share, limit)
+    limit = "launches" if least > LAUNCH_SHARE * seconds else reached.limit
+    return StageCost(stage, seconds, us, share, limit, reached.gflops, reached.gbytes, reached.compute, reached.memory)
+
+
+def _limit(stages: tuple[StageCost, ...], waits: Mapping[str, float], clock: float) -> str:
+    """What limits the whole: reading or writing where computing waits for it, else what limits the longest stage."""
+    by_name = {cost.stage: cost for cost in stages}
+    if sum(waits.values()) > WAITING_SHARE * clock:
+        label = max(waits, key=lambda name: waits[name])
+        if label == "wait for images" and by_name["decode"].seconds > by_name["read"].seconds:
+            return "decoding"
+        return "disk"
+    return max((c for c in stages if c.stage not in BACKGROUND_STAGES and c.limit), key=lambda c: c.seconds).limit
+
+
+def _overlap(background: Mapping[str, float], waits: Mapping[str, float]) -> float | None:
+    total = sum(background.values())
+    return max(0.0, 1.0 - sum(waits.values()) / total) if total > 0.0 else None
+
+
+def _peak_bytes() -> int | None:
+    """Largest memory of this process so far."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,129 @@
+"""The images of a plan, block by block: preshifted windows of every camera, read ahead of the thread that computes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.background import prepared
+from leafflow_ti.capture import Capture
+from leafflow_ti.capture.images import read_gray
+from leafflow_ti.errors import ConfigError, InputError
+from leafflow_ti.plan import Plan
+from leafflow_ti.trace import span
+
+Mask = NDArray[np.bool_]
+MAX_THREADS = 16
+"""One for each image of a frame, up to these: while a kernel runs none of them gets the interpreter, and between two
+kernels each gets it once, so that more threads than cores read faster."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A block's place in the reference image: its first row and column, and its size."""
+
+    y: int
+    x: int
+    rows: int
+    cols: int
+
+    def widened(self, margin: int) -> Box:
+        """The block with ``margin`` pixels more on every side."""
+        return Box(self.y - margin, self.x - margin, self.rows + 2 * margin, self.cols + 2 * margin)
+
+
+class Reader:
+    """Reads the blocks of a plan; ``dtype``: type of their grey values.
+
+    Raises ConfigError for a mask that does not fit the images.
+    """
+
+    def __init__(self, plan: Plan, capture: Capture, dtype: type[np.floating[Any]]):
+        self.plan, self.capture, self.dtype = plan, capture, dtype
+        self.threads = min(len(plan.cameras[0]) * len(plan.cameras[1]), MAX_THREADS)
+        self.mask = _read_mask(plan.config.output.mask, capture)
+
+    def blocks(
+        self, frames: range, box: Box, ahead: int | None = None
+    ) -> Generator[tuple[NDArray[Any], Mask], None, None]:
+        """For each frame the block [sy, sx, rows, cols], 0 where not finite, and where it is finite.
+
+        ``ahead``: how many frames are read before they are asked for; default: as planned.
+        """
+        depth = self.plan.read_ahead if ahead is None else ahead
+        return prepared(partial(self._prepare, box), frames, depth, self.threads)
+
+    def _prepare(self, box: Box, t: int) -> tuple[tuple[NDArray[Any], Mask], list[Callable[[], None]]]:
+        """An empty block of one frame, and the work that fills it."""
+        sy, sx = self.plan.cameras
+        block = np.zeros((len(sy), len(sx), box.rows, box.cols), self.dtype)
+        finite = np.ones(block.shape, bool)
+        fills = self.capture.fills(block[None], [t], sy, sx, box.y, box.x, self.plan.preshift)
+        images = (array.reshape(-1, box.rows, box.cols) for array in (block, finite))
+        whole = self.capture.dtype.kind in "bui"  # integers are finite
+        pieces: list[Callable[[], None]] = [
+            partial(_fill, whole, fill, *image) for fill, *image in zip(fills, *images, strict=True)
+        ]
+        return (block, finite), pieces
+
+    def seen(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> tuple[Mask, Mask]:
+        """Which rows ``y`` [cameras along y, n] and columns ``x`` [cameras along x, n] of blocks lie inside images."""
+        capture, shift = self.capture, self.plan.preshift
+        rows, cols = (
+            np.array(cameras)[:, None] - n for cameras, n in zip(self.plan.cameras, capture.reference, strict=True)
+        )
+        in_y, in_x = y + shift[1] * rows, x + shift[0] * cols
+        return (in_y >= 0) & (in_y < capture.height), (in_x >= 0) & (in_x < capture.width)
+
+    def inside(self, box: Box) -> Mask:
+        """Where every camera sees its image and the mask allows a measurement: [rows, cols]."""
+        capture = self.capture
+        y, x = box.y + np.arange(box.rows), box.x + np.arange(box.cols)
+        in_y, in_x = (np.logical_and.reduce(seen) for seen in self.seen(y, x))
+        inside = in_y[:, None] & in_x
+        if self.mask is None:
+            return np.asarray(inside)
+        kept = self.mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
+        return np.asarray(inside & kept)
+
+    def require_positive(self, block: NDArray[Any], valid: Mask, t: int, box: Box) -> None:
+        """Raise InputError for the first valid grey value of a block that has no logarithm."""
+        wrong = valid & (block <= 0)
+        if not wrong.any():
+            return
+        j, k, row, col = (int(n) for n in np.argwhere(wrong)[0])
+        sy, sx = self.plan.cameras[0][j], self.plan.cameras[1][k]
+        x = box.x + col + self.plan.preshift[0] * (sx - self.capture.reference[1])
+        y = box.y + row + self.plan.preshift[1] * (sy - self.capture.reference[0])
+        raise InputError(
+            f"{self.capture.image_name(t, sy, sx)}: grey value {block[j, k, row, col]:g} at pixel x = {x}, y = {y}: "
+            "prefilter homomorphic takes logarithms and needs values above 0: choose prefilter highpass, or add an "
+            "offset to the images"
+        )
+
+
+def _fill(whole: bool, fill: Callable[[], None], image: NDArray[Any], finite: Mask) -> None:
+    """Fill one image of a block; unless it is known to be ``whole``, say where it is finite, and put 0 elsewhere."""
+    with span("decode"):
+        fill()
+        if whole:
+            return
+        np.isfinite(image, out=finite)
+        if not finite.all():
+            image[~finite] = 0
+
+
+def _read_mask(path: Path | None, capture: Capture) -> Mask | None:
+    if path is None:
+        return None
+    mask: Mask = np.asarray(read_gray(path)) != 0
+    if mask.shape != (capture.height, capture.width):
+        found, wanted = (f"{shape[1]} x {shape[0]}" for shape in (mask.shape, (capture.height, capture.width)))
+        raise ConfigError(f"{path}: a mask of {found} pixels for images of {wanted}: make it the same size")
+    return mask
