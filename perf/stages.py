@@ -7,8 +7,6 @@ implementation does beyond it, halos and conversions, lowers its share.
 
 from __future__ import annotations
 
-import resource
-import sys
 from dataclasses import asdict, dataclass, field
 
 from leafflow_ti.capture import Capture
@@ -18,6 +16,7 @@ from leafflow_ti.work import Rate, Work, count_work, rate
 from perf.bench import Scene, Timed, time_stages
 from perf.cases import Options
 from perf.figures import Figure, Outcome
+from perf.fresh import peak_mib
 
 GOALS = {"A": 0.15, "B": 0.30, "C": 0.10}
 """Share of the measured multiply-add peak that each stage should reach."""
@@ -31,12 +30,6 @@ class Settings:
     strides: tuple[int, ...] = (1, 4)
     brightness: tuple[str, ...] = ("none", "camera")
     repeats: int = 5
-
-
-def peak_mib() -> float:
-    """Peak memory of this process."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _stage_figures(label: str, timed: Timed, work: dict[str, Work], pixels: int, machine: Machine) -> list[Figure]:
