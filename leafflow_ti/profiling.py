@@ -29,7 +29,7 @@ from leafflow_ti.results import ResultStore
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.trace import BACKGROUND_STAGES, STAGES, Event, Trace, active, span
-from leafflow_ti.work import Work, count_work
+from leafflow_ti.work import Rate, count_work, rate
 
 ALONE_FRAMES = 3
 """Frames read, and times a unit is written, to see what that costs by itself."""
@@ -167,13 +167,13 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
     ceilings = measure_ceilings(device)
     computed = (rows.stop - rows.start) * (cols.stop - cols.start)
     work = {stage: one * computed for stage, one in count_work(plan).items()}
-    peaks = {s: ceilings.gflops(device.storage if s in ("filter", "tensor") else device.algebra) for s in work}
     spent = {**steps.stages, **background}
-    stages = tuple(
-        _cost(s, spent[s], seconds, pixels, work.get(s), peaks.get(s, math.nan), ceilings.gbytes, least.get(s, 0.0))
-        for s in STAGES
-        if s in spent
-    )
+    reached = {
+        s: rate(s, one, spent[s], ceilings, device.storage, device.algebra)
+        for s, one in work.items()
+        if spent.get(s, 0.0) > 0.0
+    }
+    stages = tuple(_cost(s, spent[s], seconds, pixels, reached.get(s), least.get(s, 0.0)) for s in STAGES if s in spent)
     return Profile(
         plan.model, str(device), (pixels // len(plan.x), len(plan.x)), measured, compiling, seconds, pixels / seconds,
         steps.fill, stages, _limit(stages, steps.waits, seconds), _overlap(background, steps.waits), plan.bytes,
@@ -244,17 +244,13 @@ def _write(store: ResultStore, result: Result) -> None:
     store.write_unit(unit.index, unit.t_index, unit.rows, maps, status)
 
 
-def _cost(
-    stage: str, seconds: float, clock: float, pixels: int, work: Work | None, gflops: float, gbytes: float, least: float
-) -> StageCost:
+def _cost(stage: str, seconds: float, clock: float, pixels: int, reached: Rate | None, least: float) -> StageCost:
     limit = {"read": "disk", "write": "disk", "decode": "decoding", "prefilter": "compute"}.get(stage, "")
     us, share = seconds / pixels * 1e6, seconds / clock
-    if work is None or seconds <= 0.0:
+    if reached is None:
         return StageCost(stage, seconds, us, share, limit)
-    rates = (work.flops / seconds / 1e9, work.bytes / seconds / 1e9)
-    shares = (rates[0] / gflops, rates[1] / gbytes)
-    limit = "launches" if least > LAUNCH_SHARE * seconds else "memory" if shares[1] > shares[0] else "compute"
-    return StageCost(stage, seconds, us, share, limit, *rates, *shares)
+    limit = "launches" if least > LAUNCH_SHARE * seconds else reached.limit
+    return StageCost(stage, seconds, us, share, limit, reached.gflops, reached.gbytes, reached.compute, reached.memory)
 
 
 def _limit(stages: tuple[StageCost, ...], waits: Mapping[str, float], clock: float) -> str:

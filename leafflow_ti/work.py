@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from leafflow_ti.ceilings import Ceilings
 from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.plan import Plan
 from leafflow_ti.sampling import AxisSampling, Sampling, cross_noise
+from leafflow_ti.stages.estimate import GUARDED
 from leafflow_ti.stages.problem import Problem
 
 Key = tuple[Any, ...]
@@ -29,10 +31,8 @@ EXTRA = 4
 """Maps beside those of the tensor: window mass, energies of the gradient, of it smoothed once more, of the image."""
 EXTRA_FLOPS = 12
 """Their products: squares of two gradients, of the two smoothed, of the grey value, times the mask."""
-BLOCK = 4
-"""Vectors of the block inverse iteration."""
 RITZ_SWEEPS, FULL_SWEEPS = 3, 8
-"""Sweeps after which cyclic Jacobi has usually converged: of BLOCK x BLOCK and of N x N matrices."""
+"""Sweeps after which cyclic Jacobi has usually converged: of the Ritz values and of N x N matrices."""
 ROW_FLOPS = 40
 """Coefficients of one row of the motion fit."""
 
@@ -49,6 +49,31 @@ class Work:
 
     def __mul__(self, factor: float) -> Work:
         return Work(self.flops * factor, self.bytes * factor)
+
+
+@dataclass(frozen=True)
+class Rate:
+    """What a stage reached: 10^9 flops and bytes per second, and their shares of the ceilings (0..1)."""
+
+    gflops: float
+    gbytes: float
+    compute: float
+    memory: float
+
+    @property
+    def limit(self) -> str:
+        """The ceiling that is nearer: with a small share of it, instructions or the cache are what holds the stage."""
+        return "compute" if self.compute >= self.memory else "memory"
+
+
+def rate(stage: str, work: Work, seconds: float, ceilings: Ceilings, storage: str, algebra: str) -> Rate:
+    """What one of ``STAGES`` reached that did ``work`` in ``seconds``; small matrices are in the ``algebra`` precision.
+
+    ``storage``, ``algebra``: "f32" or "f64", as of a ``Device``.
+    """
+    gflops, gbytes = work.flops / seconds / 1e9, work.bytes / seconds / 1e9
+    peak = ceilings.gflops(algebra if stage in ("solve", "fit") else storage)
+    return Rate(gflops, gbytes, gflops / peak, gbytes / ceilings.gbytes)
 
 
 @dataclass(frozen=True)
@@ -233,9 +258,10 @@ def _solve_flops(problem: Problem, columns: ColumnSet) -> float:
     n, flow, k = columns.n, columns.n_flow, columns.n_time_like
     flops = n * (n + 1) + _cholesky(n) + flow * flow * k  # scaling, factor, least-squares start
     if problem.estimator != "ols" and problem.solver == "fast":
-        orthogonalise = BLOCK * (BLOCK - 1) / 2 * 4 * n + BLOCK * 3 * n
-        flops += problem.iterations * (_substitute(n, BLOCK) + orthogonalise)
-        flops += n * n * BLOCK + BLOCK * (BLOCK + 1) * n + _jacobi(BLOCK, RITZ_SWEEPS) + 4 * n * BLOCK * BLOCK
+        m = GUARDED[k]
+        orthogonalise = m * (m - 1) / 2 * 4 * n + m * 3 * n
+        flops += problem.iterations * (_substitute(n, m) + orthogonalise)
+        flops += n * n * m + m * (m + 1) * n + _jacobi(m, RITZ_SWEEPS) + 4 * n * m * m
         flops += k * (n * n + 4 * n)  # residual against the gap
     elif problem.estimator != "ols":
         flops += _jacobi(n, FULL_SWEEPS)

@@ -51,7 +51,14 @@ CASES = (
     Case("yosemite", "yosemite:run", "affine optical flow of the Yosemite sequence against its truth"),
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
     Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),
-    Case("stages", "stages:run", "microseconds per output pixel and stage, beside SciPy/NumPy; peak memory"),
+    Case("stages", "stages:run", "microseconds per output pixel and stage, share of the machine's ceilings; memory"),
+    Case(
+        "compare", "compare:run", "beside NumPy/SciPy, numba, PyTorch, structure-tensor, scikit-image: times, agreement"
+    ),
+    Case("sequence", "sequence:run_sequence", "30 frames from files against 12: time per frame, peak memory"),
+    Case("large", "sequence:run_large", "1600x1200 pixels by 9 cameras within a memory cap"),
+    Case("scene-flow-ratio", "ratio:run", "affine-scene-flow against affine-4d on the same capture"),
+    Case("scaling", "scaling:run", "cost against image size, cameras, window, stride, sigma and columns, as a picture"),
 )
 
 

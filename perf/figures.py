@@ -1,6 +1,6 @@
 """What a case reports: figures beside the printed values or goals, and how they are shown.
 
-A figure is met when it is at most its reference (and at least ``low``, where a range is wanted).
+A figure is met when it is at most its reference and at least its ``low``, as far as it has them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Figure:
     """One measured number.
 
     ``reference``: the upper limit, a value ``printed`` in the dissertation or a ``goal`` of this project; None where
-    there is none. ``low``: lower limit of a range. ``note``: what else belongs to the number.
+    there is none. ``low``: the lower limit likewise. ``note``: what else belongs to the number.
     """
 
     name: str
@@ -33,12 +33,11 @@ class Figure:
 
     @property
     def met(self) -> bool | None:
-        """Whether the reference is met or beaten; None without one. A value that is not finite never is."""
-        if self.reference is None:
+        """Whether both limits are kept; None without any. A value that is not finite keeps none."""
+        if self.reference is None and self.low is None:
             return None
-        return (
-            math.isfinite(self.value) and self.value <= self.reference and (self.low is None or self.value >= self.low)
-        )
+        below = self.reference is None or self.value <= self.reference
+        return math.isfinite(self.value) and below and (self.low is None or self.value >= self.low)
 
     def to_json(self) -> dict[str, Any]:
         """The figure as plain values; a value that is not finite becomes None, which JSON can hold."""
@@ -103,5 +102,7 @@ def _row(figure: Figure) -> tuple[str, str, str, str, str]:
         reference = f"{figure.kind} {figure.reference:g}"
         if figure.low is not None:
             reference = f"{figure.kind} {figure.low:g} to {figure.reference:g}"
+    elif figure.low is not None:
+        reference = f"{figure.kind} >= {figure.low:g}"
     verdict = {None: "", True: "met", False: "NOT MET"}[figure.met]
     return figure.name, f"{figure.value:.4g} {figure.unit}".rstrip(), reference, verdict, figure.note

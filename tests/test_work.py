@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
-from leafflow_ti.ceilings import measure_ceilings
+from leafflow_ti.ceilings import Ceilings, measure_ceilings
 from leafflow_ti.config import load_config
 from leafflow_ti.plan import Plan, make_plan
 from leafflow_ti.runtime import Device
-from leafflow_ti.work import STAGES, count_work
+from leafflow_ti.work import STAGES, Work, count_work, rate
 
 
 def capture(n_cameras: int) -> Capture:
@@ -28,7 +29,7 @@ def plan(n_cameras: int = 9, **options: Any) -> Plan:
 
 def test_optical_flow_is_counted_as_by_hand() -> None:
     found = count_work(plan(1, model="flow"))
-    # Taps of 5-tap filters: 5 of a smoothing, 4 of a derivative. Along t: I, It; along y: I, Iy, It; along x: all.
+    # 5-tap filters: 5 taps of a smoothing, 4 of a derivative. Along t: I, It; along y: I, Iy, It; along x: all three.
     filters = 2 * ((5 + 4) + (5 + 4 + 5) + (4 + 5 + 5)) + 2 * 2 * (5 + 5)
     products = 6 + 2 * 6 + (2 + 2 + 1 + 1) * 2  # each once, weighted into its map; and the four extra maps
     assert found["filter"].flops == filters + products
@@ -84,3 +85,13 @@ def test_ceilings_are_rates(device: Callable[[str], Device]) -> None:
     assert found.gbytes > 0
     assert math.isnan(found.gbytes_cache) == single.gpu
     assert found.gflops("f32") == found.gflops_f32
+
+
+def test_rates_are_shares_of_the_ceiling_of_their_precision() -> None:
+    ceilings = Ceilings(gflops_f32=400.0, gflops_f64=200.0, gbytes=40.0, gbytes_cache=300.0)
+    work = Work(flops=1e9, bytes=1e8)
+    tensor, solve = (rate(stage, work, 0.1, ceilings, "f32", "f64") for stage in ("tensor", "solve"))
+    assert (tensor.gflops, tensor.gbytes) == (10.0, 1.0)
+    assert (tensor.compute, solve.compute) == (0.025, 0.05)
+    assert (tensor.memory, tensor.limit, solve.limit) == (0.025, "compute", "compute")
+    assert rate("tensor", work * 2, 0.1, replace(ceilings, gbytes=20.0), "f32", "f64").limit == "memory"
