@@ -64,10 +64,14 @@ class _Stay:
 class Pipeline:
     """Computes the units of a plan on a device.
 
-    ``trace`` holds the seconds of the stages. Raises ConfigError for a mask that does not fit the images.
+    ``trace`` holds the seconds of the stages; ``apart``: with the stages ``solve`` and ``fit`` instead of ``estimate``,
+    which is both in one go. Raises ConfigError for a mask that does not fit the images.
     """
 
-    def __init__(self, plan: Plan, capture: Capture, device: Device, trace: Trace | None = None):
+    def __init__(
+        self, plan: Plan, capture: Capture, device: Device, trace: Trace | None = None, apart: bool = False
+    ):
+        self._apart = apart
         self.plan, self.capture, self.device = plan, capture, device
         self.trace = trace or Trace()
         self._reader = Reader(plan, capture, device.real("storage"))
@@ -140,7 +144,7 @@ class Pipeline:
         prefilter = None
         if filters.prefilter != "none":
             prefilter = Prefilter(self.device, filters.prefilter, filters.sigma_pre, read.in_rows, read.in_cols)
-        estimate = EstimateStage(self.device, problem, plan.layout, view, bool(plan.margin))
+        estimate = EstimateStage(self.device, problem, plan.layout, view, bool(plan.margin), self._apart)
         return _Engine(prefilter, tensor, estimate, ranges)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
@@ -192,9 +196,8 @@ class Pipeline:
                     if tensors is None:
                         continue
                     self.device.synchronize()
-                    with span("host"):
-                        maps, status = self._maps(engine.estimate(tensors), waiting[0], stay.centre)
-                        result = self._frame_of(index, maps, status, stay.place)
+                    maps, status = self._maps(engine.estimate(tensors), waiting[0], stay.centre)
+                    result = self._frame_of(index, maps, status, stay.place)
                 yield plan.unit(first + t - latency - plan.frames[first], index), *result
 
     def _move(self, index: int) -> _Stay:

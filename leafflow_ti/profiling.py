@@ -26,6 +26,7 @@ from leafflow_ti.errors import ConfigError
 from leafflow_ti.pipeline import Maps, Pipeline
 from leafflow_ti.plan import Plan, Unit, make_plan
 from leafflow_ti.results import ResultStore
+from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.trace import BACKGROUND_STAGES, STAGES, Event, Trace, active, span
@@ -168,6 +169,11 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
     computed = (rows.stop - rows.start) * (cols.stop - cols.start)
     work = {stage: one * computed for stage, one in count_work(plan).items()}
     spent = {**steps.stages, **background}
+    if "estimate" in spent:
+        solving = _share_of_solving(plan, capture, device, band)
+        for times in (spent, least):
+            whole = times.pop("estimate")
+            times |= {"solve": solving * whole, "fit": (1.0 - solving) * whole}
     reached = {
         s: rate(s, one, spent[s], ceilings, device.storage, device.algebra)
         for s, one in work.items()
@@ -179,6 +185,14 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
         steps.fill, stages, _limit(stages, steps.waits, seconds), _overlap(background, steps.waits), plan.bytes,
         _peak_bytes(), ceilings, predict(pipeline, band, steps.fill, seconds, steps.stages, compiling),
     )  # fmt: skip
+
+
+def _share_of_solving(plan: Plan, capture: Capture, device: Device, band: int) -> float:
+    """The part of ``solve`` in the stage ``estimate``, from a unit for which the two are launched apart."""
+    trace = Trace(barrier=device.synchronize)
+    unit = plan.unit(0, band).index
+    Pipeline(plan, capture, device, trace, apart=True).run(set(range(plan.n_units)) - {unit}, lambda *_: None)
+    return trace.seconds["solve"] / (trace.seconds["solve"] + trace.seconds["fit"])
 
 
 def predict(

@@ -99,12 +99,10 @@ def _power(exponents: tuple[int, ...], axis: str) -> int:
     return exponents[AXES.index(axis)]
 
 
-def count_work(plan: Plan, block: int = 1) -> dict[str, Work]:
-    """Work of each of ``STAGES`` per output pixel of one more frame.
-
-    ``block``: side [px] of the blocks over which the windows are constant; 1 for windows that are not.
-    """
+def count_work(plan: Plan) -> dict[str, Work]:
+    """Work of each of ``STAGES`` per output pixel of one more frame."""
     problem, stride = plan.problem, plan.config.window.stride
+    block = problem.sampling.x.blocked.step
     total = _count(problem, plan.layout, plan.config.precision, stride, block, len(plan.names), bool(plan.margin))
     if plan.ranges and plan.ranges.depth and plan.ranges.layout:
         # Range flow measures the depth of every input pixel first.
