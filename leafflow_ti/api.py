@@ -69,7 +69,7 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
         pipeline.run(set(), deliver)
     n, pixels = plan.n_units, status.size
     timings = Timings(time.perf_counter() - began, pipeline.trace.seconds, n, pixels, 1.0, 1, str(device))
-    attrs = {**_provenance(plan, capture, device), "timings": timings.to_json()}
+    attrs = {**_provenance(plan, capture, device, contents=False), "timings": timings.to_json()}
     return Field(maps, status, np.array(plan.y), np.array(plan.x), plan.frames[0], attrs)
 
 
@@ -167,8 +167,11 @@ def _decisive(value: Any) -> Any:
     return {key: section for key, section in tomllib.loads(value).items() if key != "plan"}
 
 
-def _provenance(plan: Plan, capture: Capture, device: Device) -> dict[str, Any]:
-    """What a result's reader must know: configuration, plan, versions, device, input."""
+def _provenance(plan: Plan, capture: Capture, device: Device, contents: bool = True) -> dict[str, Any]:
+    """What a result's reader must know: configuration, plan, versions, device, input.
+
+    ``contents``: with checksums of the grey values, by which a run that is resumed knows its input again.
+    """
 
     def installed(package: str) -> str:
         try:
@@ -187,5 +190,6 @@ def _provenance(plan: Plan, capture: Capture, device: Device) -> dict[str, Any]:
         "leafflow_ti_version": __version__,
         "versions": {"python": platform.python_version()} | {p: installed(p) for p in ("taichi", "numpy", "zarr")},
         "device": str(device),
-        "input": capture.fingerprint() | (plan.ranges.given.fingerprint() if plan.ranges and plan.ranges.given else {}),
+        "input": capture.fingerprint(contents)
+        | (plan.ranges.given.fingerprint() if plan.ranges and plan.ranges.given else {}),
     }  # fmt: skip

@@ -137,10 +137,10 @@ def _cross(u: list[Array], v: list[Array]) -> list[Array]:
 
 def _form(packed: list[Array], u: list[Array], v: list[Array]) -> Array:
     """``u^T C v`` for the packed symmetric C."""
-    total = np.zeros_like(packed[0])
-    for i in range(3):
-        for j in range(3):
-            total = total + u[i] * packed[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] * v[j]
+    # C v first: every element of C is used once or twice.
+    xx, yx, yy, zx, zy, zz = packed
+    rows = (xx * v[0] + yx * v[1] + zx * v[2], yx * v[0] + yy * v[1] + zy * v[2], zx * v[0] + zy * v[1] + zz * v[2])
+    total: Array = u[0] * rows[0] + u[1] * rows[1] + u[2] * rows[2]
     return total
 
 
@@ -155,12 +155,15 @@ def _both_one_sided(
 
     One-sided ones share the pixel itself: ``± (1 - R(dx)) (1 - R(dy)) / (dx dy)`` times the covariance of the velocity.
     """
-    side, factor, total = across.side * down.side, 1.0, [np.zeros(u.shape) for u in packed[0]]
+    result: Array = np.asarray(across.side * down.side, float)
+    at = np.nonzero(result)  # few: the corners of what is known
+    factor, total = 1.0, [np.zeros(at[0].size) for _ in packed[0]]
     for d, window, cov in zip((across, down), (sampling.x, sampling.y), packed, strict=True):
         factor *= 0.5 * difference_variance(window, d.step) * d.step
         central = difference_variance(window, 2 * d.step)
-        total = [t + 0.5 * u / central for t, u in zip(total, cov, strict=True)]
-    return side * factor * 2 * _form(total, *gradient)
+        total = [t + 0.5 * u[at] / central for t, u in zip(total, cov, strict=True)]
+    result[at] *= factor * 2 * _form(total, *([u[at] for u in g] for g in gradient))
+    return result
 
 
 def _moved(values: NDArray[Any], axis: int, by: int, empty: object) -> NDArray[Any]:

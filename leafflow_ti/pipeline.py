@@ -68,9 +68,7 @@ class Pipeline:
     which is both in one go. Raises ConfigError for a mask that does not fit the images.
     """
 
-    def __init__(
-        self, plan: Plan, capture: Capture, device: Device, trace: Trace | None = None, apart: bool = False
-    ):
+    def __init__(self, plan: Plan, capture: Capture, device: Device, trace: Trace | None = None, apart: bool = False):
         self._apart = apart
         self.plan, self.capture, self.device = plan, capture, device
         self.trace = trace or Trace()

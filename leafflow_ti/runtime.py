@@ -97,6 +97,12 @@ class Device:
 
         return ti.ndarray({np.int32: ti.i32, np.float32: ti.f32, np.float64: ti.f64}[dtype], (size,))
 
+    def zeros(self, size: int, kind: str = "storage") -> Any:
+        """A flat array of the device, all 0."""
+        array = self.empty(size, kind)
+        array.fill(0)
+        return array
+
     def array(self, values: Any, kind: str = "storage") -> Any:
         """A flat array of the device with these values."""
         host = np.ascontiguousarray(values, np.int32 if kind == "int" else self.real(kind)).ravel()

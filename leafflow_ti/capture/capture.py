@@ -94,8 +94,8 @@ class Capture(ABC):
         """Keep decoded images of at most so many bytes from now on."""
 
     @abstractmethod
-    def fingerprint(self) -> dict[str, Any]:
-        """What identifies the input in a result's provenance."""
+    def fingerprint(self, contents: bool = True) -> dict[str, Any]:
+        """What identifies the input in a result's provenance; with or without checksums of grey values."""
 
     def read(
         self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int, dtype: npt.DTypeLike = np.float32
@@ -203,7 +203,7 @@ class FileCapture(Capture):
             raise InputError(f"{path}: grey value {values.max():g} does not fit bit_depth = {self.bits}: correct it")
         return values
 
-    def fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self, contents: bool = True) -> dict[str, Any]:
         """Number of files, sha256 over their names (relative to the description) and sizes, and sha256 of the bytes
         of the first and the last file: the same for a copy elsewhere, cheap for any length of sequence."""
         assert self.path is not None
@@ -212,12 +212,11 @@ class FileCapture(Capture):
         for path in self.layout.paths:
             name = path.relative_to(root) if path.is_relative_to(root) else path
             listing.update(f"{name.as_posix()}\0{path.stat().st_size}\n".encode())
-        first, last = self.layout.paths[0], self.layout.paths[-1]
+        ends = {"first_file_sha256": self.layout.paths[0], "last_file_sha256": self.layout.paths[-1]}
         return {
             "files": len(self.layout.paths),
             "names_and_sizes_sha256": listing.hexdigest(),
-            "first_file_sha256": _sha256(first),
-            "last_file_sha256": _sha256(last),
+            **({name: _sha256(path) for name, path in ends.items()} if contents else {}),
         }
 
 
@@ -231,10 +230,12 @@ class ArrayCapture(Capture):
         window: Array = self.images[t, sy, sx, y0:y1, x0:x1]
         return window
 
-    def fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self, contents: bool = True) -> dict[str, Any]:
         """Shape, type, and sha256 of the values in C order."""
-        digest = hashlib.sha256(np.ascontiguousarray(self.images).data)
-        return {"shape": list(self.images.shape), "dtype": str(self.dtype), "sha256": digest.hexdigest()}
+        found: dict[str, Any] = {"shape": list(self.images.shape), "dtype": str(self.dtype)}
+        if contents:
+            found["sha256"] = hashlib.sha256(np.ascontiguousarray(self.images).data).hexdigest()
+        return found
 
 
 def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> FileCapture:

@@ -74,7 +74,7 @@ class TensorStage:
 
     def _zeros(self, size: int) -> Any:
         """Nothing that a kernel reads may be infinite, not even where the result does not count."""
-        return self.device.array(np.zeros(size, self.device.real("storage")))
+        return self.device.zeros(size)
 
     def reset(self) -> None:
         """Forget all frames: the next one pushed starts a new window."""
