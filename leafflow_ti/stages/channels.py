@@ -85,6 +85,22 @@ class Group:
     constant: float = 0.0
 
 
+def packed(groups: list[Group]) -> list[Group]:
+    """The same maps in fewer groups: what leaves weights unused is filled with the pairs of others."""
+    found: list[Group] = []
+    for group in sorted(groups, key=lambda g: -len(g.maps)):
+        room = POWERS - len(group.maps)
+        other = next((o for o in found if len(o.maps) <= room and not o.constant and not group.constant), None)
+        if other is None:
+            found.append(Group(list(group.maps), list(group.pairs), list(group.weights), group.constant))
+            continue
+        before = (0.0,) * len(other.maps)
+        other.weights += [before + w for w in group.weights]
+        other.pairs += group.pairs
+        other.maps += group.maps
+    return found
+
+
 @dataclass
 class Pass:
     """One pass along ``axis``: the planes that it makes, and how far beyond the maps (rows, columns) each is needed."""
@@ -118,6 +134,7 @@ class Channels:
             assert all(r.sampling.axis(axis) == self.sampling.axis(axis) for r in self.requests)
         for r, request in enumerate(self.requests):
             self._plan_products(r, request)
+        self.groups = packed(self.groups)
 
     @property
     def n_images(self) -> int:
@@ -196,11 +213,6 @@ class Channels:
         if request.columns.derived:
             return channel
         return self.channel(request, None if channel == "i" else channel, *where)
-
-    @cached_property
-    def maps(self) -> list[MapKey]:
-        """All maps of one frame, in the order of the groups."""
-        return [m for group in self.groups for m in group.maps]
 
     @cached_property
     def finals(self) -> list[Plane]:
