@@ -11,9 +11,9 @@ from reference import chain
 from tolerances import EXACT, tolerance
 
 from leafflow_ti.filters import FILTER_SETS, filter_set
-from leafflow_ti.models import AXES, MODELS, column_set, monomial
+from leafflow_ti.models import AXES, MODELS, OWN_FLOW, TensorLayout, column_set, monomial
 from leafflow_ti.sampling import LEAST_BLOCKS, AxisSampling, Sampling
-from leafflow_ti.stages.tensor import Band
+from leafflow_ti.stages.tensor import Band, Request, TensorStage, band_bytes
 
 PIXELS = ((0, 0), (1, 3), (2, 4))
 PASSES = ("t", "sy", "sx", "y", "x")
@@ -171,3 +171,19 @@ def test_invalid_pixels_have_no_weight(bench: Callable, make_bench: Callable) ->
         window = seen[middle - 1 : middle + 2, y - h : y + h + 1, x - h : x + h + 1]
         weights = (whole.sampling.axis(a).weights for a in ("t", "y", "x"))
         assert b.planes[-4, *pixel] == pytest.approx(np.einsum("i,j,k,ijk", *weights, window))
+
+
+@pytest.mark.parametrize("stride", [1, 4])
+def test_the_memory_plan_holds_the_arrays(device: Callable, stride: int) -> None:
+    pixel = AxisSampling.gaussian(filter_set("5"), 41, 12.0, stride)
+    sampling, alone = Sampling(pixel, pixel, sx=SERIES, t=SERIES), Sampling(pixel, pixel, t=SERIES)
+    columns = column_set(MODELS["affine-4d"], "none", sampling.camera_axes, sampling.sampled)
+    flow = column_set(OWN_FLOW, "none", (), alone.sampled)
+    own = [Request(flow, TensorLayout.of(flow), alone, (0, x)) for x in (-2, 2)]
+    band, d = Band.of(sampling, 60, 200, stride), device("f32")
+    stage = TensorStage(d, columns, TensorLayout.of(columns), sampling, band, own)
+    arrays = [*stage.tensors, *(a for a in vars(stage).values() if getattr(a, "dtype", None) == np.float32)]
+    taken = sum(a.nbytes for a in arrays)
+    planned = band_bytes(columns, TensorLayout.of(columns), sampling, band, 4, own)
+    # The plan does not know how many tasks share the scratch, and counts the output of the next stage.
+    assert 0.5 * planned < taken <= planned

@@ -60,7 +60,7 @@ class TensorStage:
         self.n_taps = 2 * sampling.t.filter_radius + 1
         geometry = lowered.geometry
         self.out_pitch = geometry.out_pitch
-        self._n_tiling = max(1, min(geometry.n_tiles, 4 * device.threads))
+        self._n_tiling = min(geometry.n_tiles, 4 * device.threads)
         lanes = geometry.lanes
         sizes = lowered.sizes(self._n_tiling, 8 * device.threads)
         self._raw, self._scratch, self._maps, self._sums, self._wide = (self._zeros(n * lanes) for n in sizes[:5])
@@ -72,7 +72,9 @@ class TensorStage:
 
     def _zeros(self, size: int) -> Any:
         """Nothing that a kernel reads may be infinite, not even where the result does not count."""
-        return self.device.array(np.zeros(size, self.device.real("storage")))
+        array = self.device.empty(size)
+        array.fill(0)
+        return array
 
     def reset(self) -> None:
         """Forget all frames: the next one pushed starts a new window."""

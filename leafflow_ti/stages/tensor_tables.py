@@ -321,7 +321,7 @@ class Lowered:
         beyond = UNROLLED * max(g.step_x, g.step_y) + g.width
         return [
             (2 * self.channels.sampling.t.filter_radius + 1) * self.frame_size + beyond,
-            (1 if self.gpu else tiling) * self.scratch + g.width,
+            min(tiling, g.n_tiles) * self.scratch + g.width,
             n_t * self.slot_size + beyond,
             sums + beyond,
             max(len(w.wides) for w in windows) * self.wide_plane + beyond,
