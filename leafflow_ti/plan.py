@@ -404,12 +404,13 @@ def _band_rows(
         # Two more rows and columns for the growth at the edges.
         band = Band.of(problem.sampling, n + 2, cols + 2, config.window.stride)
         own = problem.own_flows.requests if problem.own_flows else ()
-        total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize, own)
+        gpu = config.arch not in ("auto", "cpu")
+        total = band_bytes(problem.columns, layout, problem.sampling, band, itemsize, own, gpu)
         read = band
         if ranges and ranges.depth and ranges.layout:
             depth = ranges.depth
             read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
-            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize)
+            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize, gpu=gpu)
         if config.filters.prefilter != "none":
             total += prefilter_bytes(config.filters.sigma_pre, n_cameras, read.in_rows, read.in_cols, itemsize)
         return total

@@ -272,10 +272,11 @@ class TensorStage:
 
 
 def band_bytes(
-    columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int, own: Sequence[Request] = ()
-) -> int:
-    """Memory of the arrays of one band, from raw frames to output maps."""
-    lowered = Lowered(*_tables((Request(columns, layout, sampling), *own)), band, MOMENT_LANES)
+    columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int,
+    own: Sequence[Request] = (), gpu: bool = False,
+) -> int:  # fmt: skip
+    """Memory of the arrays of one band, from raw frames to output maps; a GPU keeps whole planes of every step."""
+    lowered = Lowered(*_tables((Request(columns, layout, sampling), *own)), band, 1 if gpu else MOMENT_LANES)
     lanes = lowered.geometry.lanes
     output = OUTPUT_PLANES * band.rows * lowered.geometry.out_pitch
     return itemsize * (lanes * sum(lowered.sizes(TASKS, TASKS)) + output)
