@@ -24,6 +24,8 @@ from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
 """Output pixels of a unit where memory allows: large enough to amortise halos, small enough to answer an interrupt."""
+INDEXED = 2**31 - 1
+"""Numbers of a unit's arrays: kernels count them in 32 bits."""
 MOTION_NAMES = tuple(f"{q}_{a}" for q in ("velocity", "rotation", "acceleration") for a in "xyz")
 
 
@@ -420,10 +422,15 @@ def _band_rows(
         chosen = min(int(config.plan.tile), rows)
     else:
         chosen = int(np.clip(BAND_PIXELS // cols, 16, rows)) if rows > 16 else rows
-        while chosen > 1 and size(chosen) > limit:
+        while chosen > 1 and size(chosen) > min(limit, INDEXED * itemsize):
             chosen = max(1, chosen * 3 // 4)
         # Bands of equal height: the last one should not be a sliver.
         chosen = -(-rows // -(-rows // chosen))
+    if limit >= size(chosen) > INDEXED * itemsize:
+        raise ConfigError(
+            f"a unit of {chosen} rows needs {size(chosen) / 2**20:.0f} MiB, and kernels can address "
+            f"{INDEXED * itemsize / 2**20:.0f} MiB: lower plan.tile, or use a roi, a smaller window"
+        )
     if size(chosen) > limit:
         raise ConfigError(
             f"a unit of {chosen} rows needs {size(chosen) / 2**20:.0f} MiB, 80 % of plan.max_memory are "
