@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from reference import chain
+from scipy.ndimage import minimum_filter
 from tolerances import EXACT, tolerance
 
 from leafflow_ti.filters import FILTER_SETS, filter_set
@@ -187,3 +188,25 @@ def test_the_memory_plan_holds_the_arrays(device: Callable, stride: int) -> None
     planned = band_bytes(columns, TensorLayout.of(columns), sampling, band, 4, own)
     # The plan does not know how many tasks share the scratch, and counts the output of the next stage.
     assert 0.5 * planned < taken <= planned
+
+
+def test_smoothness_looks_at_valid_pixels_only(bench: Callable, make_bench: Callable) -> None:
+    """Where smoothing the gradient once more would see invalid pixels, neither energy counts."""
+    whole = bench("flow-affine", "none", "single", "f64")
+    valid = np.ones((len(whole.images), *whole.images.shape[3:]), bool)
+    valid[:, :2], valid[2, 12, 9] = False, False
+    images = np.where(valid[:, None, None], whole.images, 1e6)
+    shape = (whole.band.rows, whole.band.cols)
+    b = make_bench(images, whole.sampling, whole.columns, shape=shape, stride=whole.band.stride, valid=valid)
+    size = [2 * whole.sampling.t.filter_radius + 1, *(4 * whole.sampling.axis(a).filter_radius + 1 for a in ("y", "x"))]
+    seen = minimum_filter(valid.astype(float), size, mode="nearest")
+    for pixel in PIXELS:
+        (x, y), h, m = b.position(*pixel), whole.sampling.x.size // 2, len(seen) // 2
+        window = np.s_[m - 1 : m + 2, y - h : y + h + 1, x - h : x + h + 1]
+        weights = [whole.sampling.axis(a).weights for a in ("t", "y", "x")]
+        energy = 0.0
+        for axis in ("x", "y"):
+            gradient = chain.derivative(images, whole.sampling, axis)[:, 0, 0][window]
+            energy += np.einsum("i,j,k,ijk", *weights, seen[window] * gradient**2)
+        assert 0 < b.planes[-3, *pixel] == pytest.approx(energy, rel=1e-12)
+        assert b.planes[-2, *pixel] < energy
