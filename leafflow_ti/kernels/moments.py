@@ -1,6 +1,6 @@
 """From raw frames to structure tensors: linear passes, products of channels, moment windows.
 
-What is filtered, multiplied and summed is data (see ``stages.moment_tables``), never code: a *linear pass* makes every
+What is filtered, multiplied and summed is data (see ``stages.tensor_tables``), never code: a *linear pass* makes every
 output plane as a weighted sum of shifted source planes, whichever axis the shift is along; *products* are sums of
 products of two planes with three weights each, for three powers of an offset. One compilation serves every model.
 
