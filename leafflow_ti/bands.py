@@ -20,6 +20,8 @@ BAND_PIXELS = 1 << 17
 """Output pixels of a unit where memory allows: large enough to amortise halos, small enough to answer an interrupt."""
 READ_AHEAD = 2
 """Frames read before they are needed, where memory allows: one is decoded while the other is ready."""
+INDEXED = 2**31 - 1
+"""Numbers of a unit's arrays: kernels count them in 32 bits."""
 WRITE_BEHIND = 2
 """Finished units that may wait to be written, beside the one that is being written."""
 
@@ -43,12 +45,13 @@ class Demand:
         # Two more rows and columns for the growth at the edges.
         band = Band.of(problem.sampling, rows + 2, self.cols + 2, config.window.stride)
         own = problem.own_flows.requests if problem.own_flows else ()
-        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize, own)
+        gpu = config.arch not in ("auto", "cpu")
+        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize, own, gpu)
         read = band
         if ranges and ranges.depth and ranges.layout:
             depth = ranges.depth
             read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
-            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize)
+            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize, gpu=gpu)
         margin = 0
         if config.filters.prefilter != "none":
             margin = gaussian_radius(config.filters.sigma_pre)
@@ -71,18 +74,24 @@ def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int,
     Raises ConfigError when nothing fits.
     """
     plan, limit = demand.config.plan, usable_memory(demand.config)
+    addressed = INDEXED * (4 if demand.config.precision == "f32" else 8)
     for ahead in depths:
         if plan.tile != "auto":
             chosen = min(int(plan.tile), rows)
         else:
             chosen = int(np.clip(BAND_PIXELS // demand.cols, 16, rows)) if rows > 16 else rows
-            while chosen > 1 and demand.bytes(chosen, ahead) > limit:
+            while chosen > 1 and demand.bytes(chosen, ahead) > min(limit, addressed):
                 chosen = max(1, chosen * 3 // 4)
             # Bands of equal height: the last one should not be a sliver.
             chosen = -(-rows // -(-rows // chosen))
         needed = demand.bytes(chosen, ahead)
-        if needed <= limit:
+        if needed <= min(limit, addressed):
             return chosen, needed, ahead
+    if needed <= limit:
+        raise ConfigError(
+            f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB, and kernels can address "
+            f"{addressed / 2**20:.0f} MiB: lower plan.tile, or use a roi, a smaller window"
+        )
     raise ConfigError(
         f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB, 80 % of plan.max_memory are "
         f"{limit / 2**20:.0f} MiB: raise it, lower plan.tile, or use a stride, a roi, a smaller window"

@@ -8,12 +8,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from reference import chain
+from scipy.ndimage import minimum_filter
 from tolerances import EXACT, tolerance
 
 from leafflow_ti.filters import FILTER_SETS, filter_set
-from leafflow_ti.models import AXES, MODELS, column_set, monomial
+from leafflow_ti.models import AXES, MODELS, OWN_FLOW, TensorLayout, column_set, monomial
 from leafflow_ti.sampling import LEAST_BLOCKS, AxisSampling, Sampling
-from leafflow_ti.stages.tensor import Band
+from leafflow_ti.stages.tensor import Band, Request, TensorStage, band_bytes
 
 PIXELS = ((0, 0), (1, 3), (2, 4))
 PASSES = ("t", "sy", "sx", "y", "x")
@@ -171,3 +172,41 @@ def test_invalid_pixels_have_no_weight(bench: Callable, make_bench: Callable) ->
         window = seen[middle - 1 : middle + 2, y - h : y + h + 1, x - h : x + h + 1]
         weights = (whole.sampling.axis(a).weights for a in ("t", "y", "x"))
         assert b.planes[-4, *pixel] == pytest.approx(np.einsum("i,j,k,ijk", *weights, window))
+
+
+@pytest.mark.parametrize("stride", [1, 4])
+def test_the_memory_plan_holds_the_arrays(device: Callable, stride: int) -> None:
+    pixel = AxisSampling.gaussian(filter_set("5"), 41, 12.0, stride)
+    sampling, alone = Sampling(pixel, pixel, sx=SERIES, t=SERIES), Sampling(pixel, pixel, t=SERIES)
+    columns = column_set(MODELS["affine-4d"], "none", sampling.camera_axes, sampling.sampled)
+    flow = column_set(OWN_FLOW, "none", (), alone.sampled)
+    own = [Request(flow, TensorLayout.of(flow), alone, (0, x)) for x in (-2, 2)]
+    band, d = Band.of(sampling, 60, 200, stride), device("f32")
+    stage = TensorStage(d, columns, TensorLayout.of(columns), sampling, band, own)
+    arrays = [*stage.tensors, *(a for a in vars(stage).values() if getattr(a, "dtype", None) == np.float32)]
+    taken = sum(a.nbytes for a in arrays)
+    planned = band_bytes(columns, TensorLayout.of(columns), sampling, band, 4, own)
+    # The plan does not know how many tasks share the scratch, and counts the output of the next stage.
+    assert 0.5 * planned < taken <= planned
+
+
+def test_smoothness_looks_at_valid_pixels_only(bench: Callable, make_bench: Callable) -> None:
+    """Where smoothing the gradient once more would see invalid pixels, neither energy counts."""
+    whole = bench("flow-affine", "none", "single", "f64")
+    valid = np.ones((len(whole.images), *whole.images.shape[3:]), bool)
+    valid[:, :2], valid[2, 12, 9] = False, False
+    images = np.where(valid[:, None, None], whole.images, 1e6)
+    shape = (whole.band.rows, whole.band.cols)
+    b = make_bench(images, whole.sampling, whole.columns, shape=shape, stride=whole.band.stride, valid=valid)
+    size = [2 * whole.sampling.t.filter_radius + 1, *(4 * whole.sampling.axis(a).filter_radius + 1 for a in ("y", "x"))]
+    seen = minimum_filter(valid.astype(float), size, mode="nearest")
+    for pixel in PIXELS:
+        (x, y), h, m = b.position(*pixel), whole.sampling.x.size // 2, len(seen) // 2
+        window = np.s_[m - 1 : m + 2, y - h : y + h + 1, x - h : x + h + 1]
+        weights = [whole.sampling.axis(a).weights for a in ("t", "y", "x")]
+        energy = 0.0
+        for axis in ("x", "y"):
+            gradient = chain.derivative(images, whole.sampling, axis)[:, 0, 0][window]
+            energy += np.einsum("i,j,k,ijk", *weights, seen[window] * gradient**2)
+        assert 0 < b.planes[-3, *pixel] == pytest.approx(energy, rel=1e-12)
+        assert b.planes[-2, *pixel] < energy

@@ -1,6 +1,6 @@
 """From raw frames to structure tensors: linear passes, products of channels, moment windows.
 
-What is filtered, multiplied and summed is data (see ``stages.moment_tables``), never code: a *linear pass* makes every
+What is filtered, multiplied and summed is data (see ``stages.tensor_tables``), never code: a *linear pass* makes every
 output plane as a weighted sum of shifted source planes, whichever axis the shift is along; *products* are sums of
 products of two planes with three weights each, for three powers of an offset. One compilation serves every model.
 
@@ -97,7 +97,6 @@ def formulas(spec: KernelSpec):
     def products(
         g: ti.i32,
         at: ti.i32,
-        invalid: ti.i32,
         to: ti.i32,
         plane: ti.i32,
         first: ti.template(),
@@ -105,10 +104,11 @@ def formulas(spec: KernelSpec):
         two: ti.template(),
         weight: ti.template(),
         constant: ti.template(),
+        invalid: ti.template(),
         src: ti.template(),
         dst: ti.template(),
     ):
-        """``dst[p] = constant + Σ_k weight[k, p] src[one[k]] src[two[k]]``, 0 where ``src[invalid]`` is not."""
+        """``dst[p] = constant + Σ_k weight[k, p] src[one[k]] src[two[k]]``, 0 where ``src[invalid[g]]`` is not."""
         half = ti.cast(0.5, spec.real)
         full = zero() + ti.cast(1, spec.real)
         for pair in range(1 if ti.static(block == 1) else block // 2):
@@ -128,13 +128,13 @@ def formulas(spec: KernelSpec):
                     u0 += w0 * q
                     u1 += w1 * q
                     u2 += w2 * q
-            seen = ti.select(src[invalid + 2 * pair] > half, zero(), full)
+            seen = ti.select(src[here + invalid[g]] > half, zero(), full)
             place = to + 2 * pair
             dst[place] = seen * s0
             dst[place + plane] = seen * s1
             dst[place + 2 * plane] = seen * s2
             if ti.static(block > 1):
-                seen = ti.select(src[invalid + 2 * pair + 1] > half, zero(), full)
+                seen = ti.select(src[here + 1 + invalid[g]] > half, zero(), full)
                 dst[place + 1] = seen * u0
                 dst[place + 1 + plane] = seen * u1
                 dst[place + 1 + 2 * plane] = seen * u2

@@ -63,7 +63,6 @@ def products_kernel(spec: KernelSpec):
         begin: ti.i32,
         rows: ti.i32,
         pitch: ti.i32,
-        invalid: ti.i32,
         to: ti.i32,
         plane: ti.i32,
         group_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_groups + 1]
@@ -71,14 +70,15 @@ def products_kernel(spec: KernelSpec):
         two_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_pairs]
         factor_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_pairs, POWERS]
         constant_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_groups]
+        invalid_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_groups]
         scratch_tmp: ti.types.ndarray(dtype=spec.real, ndim=1),  # [any]
     ):
         for h in range(n_groups * rows * pitch):
             g = h // (rows * pitch)
             pixel = h - g * (rows * pitch)
             products(
-                begin + g, pixel, pixel + invalid, to + g * POWERS * plane + pixel, plane,
-                group_in, one_in, two_in, factor_in, constant_in, scratch_tmp, scratch_tmp,
+                begin + g, pixel, to + g * POWERS * plane + pixel, plane,
+                group_in, one_in, two_in, factor_in, constant_in, invalid_in, scratch_tmp, scratch_tmp,
             )  # fmt: skip
 
     return multiply_planes

@@ -59,13 +59,13 @@ def tile_kernel(spec: KernelSpec):
         home: ti.i32,
         inner: ti.i32,
         inner_blocks: ti.i32,
-        invalid: ti.i32,
         steps: ti.template(),
         group: ti.template(),
         one: ti.template(),
         two: ti.template(),
         factor: ti.template(),
         constant: ti.template(),
+        invalid: ti.template(),
         scratch: ti.template(),
     ):
         plane = steps[at + Step.TARGET_PLANE]
@@ -73,9 +73,7 @@ def tile_kernel(spec: KernelSpec):
             x = inner + BLOCK * c
             for g in range(steps[at + Step.FIRST], steps[at + Step.LAST]):
                 to = home + steps[at + Step.TARGET] + (g - steps[at + Step.FIRST]) * POWERS * plane + x
-                products(
-                    g, home + x, home + x + invalid, to, plane, group, one, two, factor, constant, scratch, scratch
-                )
+                products(g, home + x, to, plane, group, one, two, factor, constant, invalid, scratch, scratch)
 
     @lane_kernel(spec.lanes)
     def filter_tiles(
@@ -93,7 +91,6 @@ def tile_kernel(spec: KernelSpec):
         map_tile: ti.i32,  # columns of maps that a tile makes
         maps_at: ti.i32,
         scratch_size: ti.i32,
-        invalid: ti.i32,  # place of the count of invalid pixels
         inner: ti.i32,  # first column of products in a row of scratch
         inner_blocks: ti.i32,
         steps_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_steps, Step.N]
@@ -109,6 +106,7 @@ def tile_kernel(spec: KernelSpec):
         two_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_pairs]
         factor_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_pairs, POWERS]
         constant_in: ti.types.ndarray(dtype=spec.real, ndim=1),  # [n_groups]
+        invalid_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_groups], where invalid pixels are counted
         raw_in: ti.types.ndarray(dtype=V, ndim=1),  # [frames, tiles, rows, images, columns]
         scratch_tmp: ti.types.ndarray(dtype=V, ndim=1),  # [any]
         maps_out: ti.types.ndarray(dtype=V, ndim=1),  # [frames, maps, segment, pitch]
@@ -142,8 +140,8 @@ def tile_kernel(spec: KernelSpec):
                                 row, early = i - 2 * halo, -1
                             if steps_in[at + Step.PRODUCTS] == 1:
                                 product_step(
-                                    at, home, inner, inner_blocks, invalid, steps_in,
-                                    group_in, one_in, two_in, factor_in, constant_in, scratch_tmp,
+                                    at, home, inner, inner_blocks, steps_in,
+                                    group_in, one_in, two_in, factor_in, constant_in, invalid_in, scratch_tmp,
                                 )  # fmt: skip
                             else:
                                 to = home + steps_in[at + Step.TARGET]

@@ -36,7 +36,7 @@ EXTRAS = ("mass", "energy", "smooth", "level")
 class Plane(NamedTuple):
     """An image [row, col] of a frame and the kernel that was applied along each axis, "" where none was yet.
 
-    Kernels: "b" smoothing, "d" derivative, "1" none, "n" counts, "bb" and "db" with smoothing once more.
+    Kernels: "b" smoothing, "d" derivative, "1" none, "n" counts; "bb", "db" and "nn" with smoothing once more.
     """
 
     row: int
@@ -46,6 +46,12 @@ class Plane(NamedTuple):
     sx: str = ""
     y: str = ""
     x: str = ""
+
+
+INVALID_SEEN = Plane(INVALID, 0, "n", "1", "1", "n", "n")
+"""How many invalid pixels the filters see."""
+INVALID_SEEN_TWICE = INVALID_SEEN._replace(y="nn", x="nn")
+"""The same for filters that are followed by smoothing in the image once more."""
 
 
 @dataclass(frozen=True)
@@ -77,12 +83,34 @@ MASS = MapKey(0, (EXTRAS[0],))
 
 @dataclass
 class Group:
-    """Up to ``POWERS`` maps of the same products: pairs of planes, and a weight for each map. ``constant`` is added."""
+    """Up to ``POWERS`` maps of the same products: pairs of planes, and a weight for each map. ``constant`` is added.
+
+    Pixels that do not count are those where the plane ``invalid`` is not 0.
+    """
 
     maps: list[MapKey]
     pairs: list[tuple[Plane | str, Plane | str]]
     weights: list[tuple[float, ...]]
     constant: float = 0.0
+    invalid: Plane = INVALID_SEEN
+
+
+def packed(groups: list[Group]) -> list[Group]:
+    """The same maps in fewer groups: what leaves weights unused is filled with the pairs of others."""
+    found: list[Group] = []
+    for group in sorted(groups, key=lambda g: -len(g.maps)):
+        room = POWERS - len(group.maps)
+        alike = (o for o in found if o.invalid == group.invalid and not o.constant and not group.constant)
+        other = next((o for o in alike if len(o.maps) <= room), None)
+        if other is None:
+            copied = list(group.maps), list(group.pairs), list(group.weights)
+            found.append(Group(*copied, group.constant, group.invalid))
+            continue
+        before = (0.0,) * len(other.maps)
+        other.weights += [before + w for w in group.weights]
+        other.pairs += group.pairs
+        other.maps += group.maps
+    return found
 
 
 @dataclass
@@ -118,6 +146,7 @@ class Channels:
             assert all(r.sampling.axis(axis) == self.sampling.axis(axis) for r in self.requests)
         for r, request in enumerate(self.requests):
             self._plan_products(r, request)
+        self.groups = packed(self.groups)
 
     @property
     def n_images(self) -> int:
@@ -136,8 +165,8 @@ class Channels:
         sampling = self.sampling.axis(axis)
         if name == "1":
             return np.ones(1)
-        if name == "n":
-            return np.ones(2 * sampling.filter_radius + 1)
+        if name in ("n", "nn"):
+            return np.ones(2 * len(name) * sampling.filter_radius + 1)
         once = sampling.kernel(name[0] == "d")
         return np.convolve(once, sampling.kernel(False)) if len(name) == 2 else once
 
@@ -148,8 +177,6 @@ class Channels:
             for a in ("t", "sy", "sx", "y", "x")
         ]
         return Plane(row, col, *names)
-
-    invalid = Plane(INVALID, 0, "n", "1", "1", "n", "n")
 
     def _plan_products(self, r: int, request: Request) -> None:
         columns, sampling = request.columns, request.sampling
@@ -182,7 +209,7 @@ class Channels:
                 self.groups.append(group)
         gx, gy = (self.channel(request, a, *centre) for a in ("x", "y"))
         grey = Plane(*centre, *"11111")
-        extra = Group([MapKey(r, (name,)) for name in EXTRAS[1:]], [], [])
+        extra = Group([MapKey(r, (name,)) for name in EXTRAS[1:]], [], [], invalid=INVALID_SEEN_TWICE)
         for k, planes in enumerate(((gx, gy), (gx._replace(y="bb", x="db"), gy._replace(y="db", x="bb")), (grey,))):
             for plane in planes:
                 extra.pairs.append((plane, plane))
@@ -198,14 +225,9 @@ class Channels:
         return self.channel(request, None if channel == "i" else channel, *where)
 
     @cached_property
-    def maps(self) -> list[MapKey]:
-        """All maps of one frame, in the order of the groups."""
-        return [m for group in self.groups for m in group.maps]
-
-    @cached_property
     def finals(self) -> list[Plane]:
         """The planes that products are made of."""
-        found: dict[Plane, None] = {self.invalid: None}
+        found: dict[Plane, None] = {INVALID_SEEN: None, INVALID_SEEN_TWICE: None}
         operands: Iterable[Plane | str | None] = [p for g in self.groups for pair in g.pairs for p in pair]
         operands = [*operands, *(p for pair in self.derived.values() for p in pair)]
         found.update({p: None for p in operands if isinstance(p, Plane)})

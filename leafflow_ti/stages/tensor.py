@@ -61,7 +61,7 @@ class TensorStage:
         self.n_taps = 2 * sampling.t.filter_radius + 1
         geometry = lowered.geometry
         self.out_pitch = geometry.out_pitch
-        self._n_tiling = max(1, min(geometry.n_tiles, 4 * device.threads))
+        self._n_tiling = min(geometry.n_tiles, 4 * device.threads)
         lanes = geometry.lanes
         sizes = lowered.sizes(self._n_tiling, 8 * device.threads)
         self._raw, self._scratch, self._maps, self._sums, self._wide = (self._zeros(n * lanes) for n in sizes[:5])
@@ -90,14 +90,15 @@ class TensorStage:
         linear, array = lowered.linear, self.device.array
         terms = Terms.of(linear.terms)
         groups = lowered.groups
-        first = np.cumsum([0] + [len(pairs) for pairs, _, _ in groups])
-        pairs = [p for some, _, _ in groups for p in some]
+        first = np.cumsum([0] + [len(pairs) for pairs, *_ in groups])
+        pairs = [p for some, *_ in groups for p in some]
         return (
             array(lowered.steps, "int"), array(terms.first, "int"), array(linear.column, "int"),
             array(linear.blocks, "int"), array(linear.trim, "int"), array([s[0] for s in terms.source], "int"),
             array([s[1] for s in terms.source], "int"), array(terms.weight), array(first, "int"),
             array([p[0] for p in pairs], "int"), array([p[1] for p in pairs], "int"),
-            array([w for _, weights, _ in groups for w in weights]), array([c for _, _, c in groups]),
+            array([w for _, weights, *_ in groups for w in weights]), array([c for *_, c, _ in groups]),
+            array([i for *_, i in groups], "int"),
         )  # fmt: skip
 
     def _device_windows(self, windows: Windows) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...], int]:
@@ -202,7 +203,7 @@ class TensorStage:
         tile_kernel(device.moments)(
             len(lowered.steps), lowered.n_raw, lowered.n_early, g.n_tiles, self._n_tiling, lowered.raw_row,
             g.map_rows, g.halo[0], self._pushed % self.n_taps, g.y.step, g.y.length, g.map_tile, maps_at,
-            lowered.scratch, lowered.invalid, g.halo[1], -(-g.inner // UNROLLED), *self._filter_tables, *arrays,
+            lowered.scratch, g.halo[1], -(-g.inner // UNROLLED), *self._filter_tables, *arrays,
         )  # fmt: skip
 
     def _make_tensor(self, number: int) -> None:
@@ -243,9 +244,7 @@ class TensorStage:
             begin, n = step[Step.FIRST], step[Step.LAST] - step[Step.FIRST]
             to, plane, pitch = step[Step.TARGET], step[Step.TARGET_PLANE], step[Step.TARGET_HOP]
             if step[Step.PRODUCTS]:
-                products_kernel(spec)(
-                    n, begin, g.map_rows, g.width, lowered.invalid, to, plane, *products, self._scratch
-                )
+                products_kernel(spec)(n, begin, g.map_rows, g.width, to, plane, *products, self._scratch)
                 continue
             raw, last = number < lowered.n_raw, number == len(lowered.steps) - 1
             rows = g.tall if number < lowered.n_early else g.block_segment if last else g.map_rows
@@ -279,10 +278,11 @@ class TensorStage:
 
 
 def band_bytes(
-    columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int, own: Sequence[Request] = ()
-) -> int:
-    """Memory of the arrays of one band, from raw frames to output maps."""
-    lowered = Lowered(*_tables((Request(columns, layout, sampling), *own)), band, MOMENT_LANES)
+    columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int,
+    own: Sequence[Request] = (), gpu: bool = False,
+) -> int:  # fmt: skip
+    """Memory of the arrays of one band, from raw frames to output maps; a GPU keeps whole planes of every step."""
+    lowered = Lowered(*_tables((Request(columns, layout, sampling), *own)), band, 1 if gpu else MOMENT_LANES)
     lanes = lowered.geometry.lanes
     output = OUTPUT_PLANES * band.rows * lowered.geometry.out_pitch
     return itemsize * (lanes * sum(lowered.sizes(TASKS, TASKS)) + output)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.sampling import Sampling
-from leafflow_ti.stages.channels import POWERS, UNROLLED, Channels, MapKey, Pass, Plane
+from leafflow_ti.stages.channels import INVALID_SEEN, POWERS, UNROLLED, Channels, MapKey, Pass, Plane
 from leafflow_ti.stages.planes import Terms, round_up
 from leafflow_ti.stages.windows import Windows, block_weights, taps, x_powers
 
@@ -228,24 +228,24 @@ class Lowered:
         """Derived channels, then maps; the places of the maps."""
         channels = self.channels
         operands: dict[Any, int] = dict(places)
-        groups: list[tuple[list[tuple[int, int]], list[tuple[float, ...]], float]] = []
+        groups: list[tuple[list[tuple[int, int]], list[tuple[float, ...]], float, int]] = []
         pairs = {name: pair for name, pair in channels.derived.items() if pair[1] is not None}
         operands |= {name: places[pair[0]] for name, pair in channels.derived.items() if pair[1] is None}
         if pairs:
             target = self._region(POWERS * len(pairs), False)
             for n, (name, (one, two)) in enumerate(pairs.items()):
                 assert two is not None
-                groups.append(([(places[one], places[two])], [(1.0, 0.0, 0.0)], 0.0))
+                groups.append(([(places[one], places[two])], [(1.0, 0.0, 0.0)], 0.0, places[INVALID_SEEN]))
                 operands[name] = target.at(POWERS * n)
             self._step(len(pairs), None, target, products=1)
         target = self._region(POWERS * len(channels.groups), False)
         maps: dict[MapKey, int] = {}
         for n, group in enumerate(channels.groups):
             weights = [w + (0.0,) * (POWERS - len(w)) for w in group.weights]
-            groups.append(([(operands[a], operands[b]) for a, b in group.pairs], weights, group.constant))
+            both = [(operands[a], operands[b]) for a, b in group.pairs]
+            groups.append((both, weights, group.constant, places[group.invalid]))
             maps |= {key: target.at(POWERS * n + p) for p, key in enumerate(group.maps)}
         self._step(len(channels.groups), None, target, products=1)
-        self.invalid = places[channels.invalid]
         self.groups = groups
         return maps, target
 
@@ -321,7 +321,7 @@ class Lowered:
         beyond = UNROLLED * max(g.step_x, g.step_y) + g.width
         return [
             (2 * self.channels.sampling.t.filter_radius + 1) * self.frame_size + beyond,
-            (1 if self.gpu else tiling) * self.scratch + g.width,
+            min(tiling, g.n_tiles) * self.scratch + g.width,
             n_t * self.slot_size + beyond,
             sums + beyond,
             max(len(w.wides) for w in windows) * self.wide_plane + beyond,
