@@ -29,7 +29,7 @@ class Settings:
     scene: Scene = field(default_factory=Scene)
     strides: tuple[int, ...] = (1, 4)
     brightness: tuple[str, ...] = ("none", "camera")
-    repeats: int = 5
+    repeats: int = 9
 
 
 def _stage_figures(label: str, timed: Timed, work: dict[str, Work], pixels: int, machine: Machine) -> list[Figure]:

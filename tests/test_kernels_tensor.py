@@ -183,7 +183,7 @@ def test_the_memory_plan_holds_the_arrays(device: Callable, stride: int) -> None
     own = [Request(flow, TensorLayout.of(flow), alone, (0, x)) for x in (-2, 2)]
     band, d = Band.of(sampling, 60, 200, stride), device("f32")
     stage = TensorStage(d, columns, TensorLayout.of(columns), sampling, band, own)
-    arrays = [*stage.tensors, *(a for a in vars(stage).values() if getattr(a, "dtype", None) == np.float32)]
+    arrays = [a for a in vars(stage).values() if getattr(a, "dtype", None) == np.float32]
     taken = sum(a.nbytes for a in arrays)
     planned = band_bytes(columns, TensorLayout.of(columns), sampling, band, 4, own)
     # The plan does not know how many tasks share the scratch, and counts the output of the next stage.
