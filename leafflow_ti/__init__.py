@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from leafflow_ti.api import estimate, plan_run, run
     from leafflow_ti.capture import Capture, Geometry, capture_from_array, open_capture
     from leafflow_ti.config import RunConfig, load_config
+    from leafflow_ti.engines import release
     from leafflow_ti.field import Field
     from leafflow_ti.results import ResultStore
 
@@ -23,10 +24,11 @@ _HOME = {
     "estimate": "api", "plan_run": "api", "run": "api",
     "Capture": "capture", "Geometry": "capture", "capture_from_array": "capture", "open_capture": "capture",
     "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
+    "release": "engines",
 }  # fmt: skip
 __all__ = [
     "Capture", "Field", "Geometry", "ResultStore", "RunConfig", "capture_from_array", "estimate", "load_config",
-    "open_capture", "plan_run", "run",
+    "open_capture", "plan_run", "release", "run",
 ]  # fmt: skip
 
 

@@ -40,6 +40,8 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
     of those that can be measured). ``options``: those of ``run`` as keywords, e.g. ``model="affine-4d",
     motion="rotation", preshift=(-14, 0), window=65, sigma=19, stride=4, roi=(x0, y0, x1, y1)``.
 
+    Arrays of up to 512 MiB are kept for the next call with the same options and region; ``release`` gives them back.
+
     Returns a Field of float32 maps [y, x]. Raises ConfigError, InputError, DeviceError.
     """
     if not isinstance(capture, Capture):
@@ -48,7 +50,7 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
         options["frames"] = f"{frame}:{frame + 1}"
     config = load_config(overrides=options)
     plan = make_plan(capture, config)
-    if frame is None:
+    if frame is None and len(plan.frames) > 1:
         middle = plan.frames[len(plan.frames) // 2]
         return estimate(capture, middle, **options)
     from leafflow_ti.kernels.engine import quick_front_end
@@ -67,6 +69,7 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
 
     with quick_front_end():
         pipeline.run(set(), deliver)
+    pipeline.keep()
     n, pixels = plan.n_units, status.size
     timings = Timings(time.perf_counter() - began, pipeline.trace.seconds, n, pixels, 1.0, 1, str(device))
     attrs = {**_provenance(plan, capture, device, contents=False), "timings": timings.to_json()}

@@ -15,37 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.capture import Capture
+from leafflow_ti.engines import Engine, keep
 from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
 from leafflow_ti.plan import Plan, Unit
-from leafflow_ti.range_engine import RangeEngine, Sample
+from leafflow_ti.range_engine import Sample
 from leafflow_ti.reading import Box, Reader
 from leafflow_ti.runtime import Device
-from leafflow_ti.stages.estimate import EstimateStage, View
+from leafflow_ti.stages.estimate import View
 from leafflow_ti.stages.prefilter import Prefilter
-from leafflow_ti.stages.tensor import Band, TensorStage
+from leafflow_ti.stages.tensor import Band
 from leafflow_ti.status import HAS_VALUE, Status
 from leafflow_ti.trace import Trace, active, span
 
 Maps = dict[str, NDArray[np.float32]]
 _NO_IMAGES: NDArray[Any] = np.empty((0, 0, 0, 0), np.float32)
-
-
-@dataclass
-class _Engine:
-    """The stages for bands of one height: prefilter, tensors of the reference model and of the own flows, estimate."""
-
-    prefilter: Prefilter | None
-    tensor: TensorStage
-    estimate: EstimateStage
-    ranges: RangeEngine | None = None
-
-    def reset(self) -> None:
-        """Forget all frames."""
-        self.tensor.reset()
-
-    def push(self, sample: Sample) -> Any | None:
-        """Add a frame of every camera; the tensors once the windows are full."""
-        return self.tensor.push(sample.block, sample.valid, sample.factors)
 
 
 @dataclass(frozen=True)
@@ -54,7 +37,7 @@ class _Stay:
     [rows, cols] of the block without it: pixels that may count; ``place``: of the computed rectangle among the rows
     around the band; ``centre``: the block's pixels at the output positions."""
 
-    engine: _Engine
+    engine: Engine
     box: Box
     allowed: NDArray[np.bool_]
     place: tuple[slice, slice]
@@ -73,7 +56,7 @@ class Pipeline:
         self.plan, self.capture, self.device = plan, capture, device
         self.trace = trace or Trace()
         self._reader = Reader(plan, capture, device.real("storage"))
-        self._engines: dict[int, _Engine] = {}
+        self._engines: dict[int, Engine] = {}
         # Output pixels of the plan and those around them; rows and columns below count along these.
         self._y, self._x = (_widened(r, n, plan.margin) for r, n in ((plan.y, capture.height), (plan.x, capture.width)))
         self._rows = self._measurable("y", self._y, capture.height, 1)
@@ -131,19 +114,13 @@ class Pipeline:
                     for unit, maps, status in units:
                         deliver(unit, maps, status)
 
-    def _make_engine(self, band: Band) -> _Engine:
-        plan, problem = self.plan, self.plan.problem
-        own = problem.own_flows.requests if problem.own_flows else ()
-        tensor = TensorStage(self.device, problem.columns, plan.layout, problem.sampling, band, own)
-        view = self._view((0, 0), band, tensor.out_pitch)
-        ranges = RangeEngine(self.device, plan.ranges, problem.sampling, view, band) if plan.ranges else None
-        read = ranges.outer if ranges else band
-        filters = plan.config.filters
-        prefilter = None
-        if filters.prefilter != "none":
-            prefilter = Prefilter(self.device, filters.prefilter, filters.sigma_pre, read.in_rows, read.in_cols)
-        estimate = EstimateStage(self.device, problem, plan.layout, view, bool(plan.margin), self._apart)
-        return _Engine(prefilter, tensor, estimate, ranges)
+    def _make_engine(self, band: Band) -> Engine:
+        return Engine.of(self.device, self.plan, band, lambda pitch: self._view((0, 0), band, pitch), self._apart)
+
+    def keep(self) -> None:
+        """Keep the stages of the last bands for the next estimate."""
+        for engine in self._engines.values():
+            keep(engine, self.plan)
 
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
         """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.

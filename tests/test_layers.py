@@ -23,7 +23,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
     **dict.fromkeys(("growth",), 5),
-    **dict.fromkeys(("bands", "plan", "reading", "pipeline", "results", "work"), 6),
+    **dict.fromkeys(("bands", "plan", "reading", "engines", "pipeline", "results", "work"), 6),
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases"), 7),
     **dict.fromkeys(("cli",), 8),

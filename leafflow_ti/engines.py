@@ -1,0 +1,85 @@
+"""The stages for bands of one size, and the one set of them that is kept from one estimate to the next.
+
+Tables, and memory that has to be fetched from the system page by page, cost as much as measuring a small region.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from leafflow_ti.plan import Plan
+from leafflow_ti.range_engine import RangeEngine, Sample
+from leafflow_ti.runtime import Device
+from leafflow_ti.stages.estimate import EstimateStage, View
+from leafflow_ti.stages.prefilter import Prefilter
+from leafflow_ti.stages.tensor import Band, TensorStage
+
+KEPT_BYTES = 512 << 20
+"""Largest plan whose stages are kept."""
+
+
+@dataclass
+class Engine:
+    """The stages for bands of one size: prefilter, tensors of the reference model and of the own flows, estimate.
+
+    ``key``: what they depend on.
+    """
+
+    key: tuple[Any, ...]
+    prefilter: Prefilter | None
+    tensor: TensorStage
+    estimate: EstimateStage
+    ranges: RangeEngine | None = None
+
+    @classmethod
+    def of(cls, device: Device, plan: Plan, band: Band, view: Callable[[int], View], apart: bool) -> Engine:
+        """The kept stages if they are the ones, else new ones. ``view``: of an output of a given pitch."""
+        problem, filters = plan.problem, plan.config.filters
+        key = (device, problem, plan.layout, band, bool(plan.margin), filters.prefilter, filters.sigma_pre, apart)
+        kept = None if plan.ranges else _take(key)
+        if kept is not None:
+            return kept
+        own = problem.own_flows.requests if problem.own_flows else ()
+        tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band, own)
+        first = view(tensor.out_pitch)
+        ranges = RangeEngine(device, plan.ranges, problem.sampling, first, band) if plan.ranges else None
+        read = ranges.outer if ranges else band
+        prefilter = None
+        if filters.prefilter != "none":
+            prefilter = Prefilter(device, filters.prefilter, filters.sigma_pre, read.in_rows, read.in_cols)
+        estimate = EstimateStage(device, problem, plan.layout, first, bool(plan.margin), apart)
+        return cls(key, prefilter, tensor, estimate, ranges)
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self.tensor.reset()
+
+    def push(self, sample: Sample) -> Any | None:
+        """Add a frame of every camera; the tensors once the windows are full."""
+        return self.tensor.push(sample.block, sample.valid, sample.factors)
+
+
+_kept: list[Engine] = []
+_lock = threading.Lock()
+
+
+def _take(key: tuple[Any, ...]) -> Engine | None:
+    """The kept stages, which are then no longer kept: two estimates never share them."""
+    with _lock:
+        return _kept.pop() if _kept and _kept[0].key == key else None
+
+
+def keep(engine: Engine, plan: Plan) -> None:
+    """Keep the stages of an estimate that has ended for the next one; large ones, and those of range flow, are not."""
+    if engine.ranges is None and plan.bytes <= KEPT_BYTES:
+        with _lock:
+            _kept[:] = [engine]
+
+
+def release() -> None:
+    """Give back the memory that was kept for the next ``estimate``."""
+    with _lock:
+        _kept.clear()
