@@ -188,11 +188,18 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
 
 
 def _share_of_solving(plan: Plan, capture: Capture, device: Device, band: int) -> float:
-    """The part of ``solve`` in the stage ``estimate``, from a unit for which the two are launched apart."""
+    """The part of ``solve`` in the stage ``estimate``, from a unit for which the two are launched apart.
+
+    The second time counts: at the first, memory is fetched from the system.
+    """
     trace = Trace(barrier=device.synchronize)
-    unit = plan.unit(0, band).index
-    Pipeline(plan, capture, device, trace, apart=True).run(set(range(plan.n_units)) - {unit}, lambda *_: None)
-    return trace.seconds["solve"] / (trace.seconds["solve"] + trace.seconds["fit"])
+    pipeline = Pipeline(plan, capture, device, trace, apart=True)
+    others = set(range(plan.n_units)) - {plan.unit(0, band).index}
+    pipeline.run(others, lambda *_: None)
+    before = trace.seconds
+    pipeline.run(others, lambda *_: None)
+    solve, fit = (trace.seconds[stage] - before[stage] for stage in ("solve", "fit"))
+    return solve / (solve + fit)
 
 
 def predict(
