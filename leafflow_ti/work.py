@@ -22,7 +22,7 @@ from leafflow_ti.ceilings import Ceilings
 from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.plan import Plan
 from leafflow_ti.sampling import AxisSampling, Sampling, cross_noise
-from leafflow_ti.stages.estimate import GUARDED
+from leafflow_ti.stages.estimate_tables import GUARDED
 from leafflow_ti.stages.problem import Problem
 
 Key = tuple[Any, ...]

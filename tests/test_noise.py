@@ -12,7 +12,7 @@ import pytest
 from reference import chain
 
 from leafflow_ti.models import MODELS, column_set
-from leafflow_ti.stages.estimate import DENOISE
+from leafflow_ti.stages.estimate_tables import DENOISE
 from leafflow_ti.status import Status
 
 SCENE = replace(

@@ -2,106 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.models import AXES, ColumnSet, TensorLayout
+from leafflow_ti.models import TensorLayout
 from leafflow_ti.runtime import Device
-from leafflow_ti.sampling import (
-    NoiseTerm,
-    Sampling,
-    column_noise,
-    cross_noise,
-    difference_variance,
-    noise_ratio,
-    shared_noise,
-    white_smoothness,
-)
+from leafflow_ti.stages.estimate_tables import ProblemTables, View
 from leafflow_ti.stages.estimators import ESTIMATORS
-from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, OwnFlows, Problem
+from leafflow_ti.stages.problem import Problem
 from leafflow_ti.trace import span
 
+__all__ = ["EstimateStage", "View"]
 BATCH_BYTES = 16 << 20
 """Workspace of one batch of pixels on the CPU where the steps are launched apart."""
 GPU_GROUPS = 1 << 15
 CHUNK_GROUPS = 2048
 """Groups of a launch on the CPU: some tenths of a second, so that an interrupt is noticed."""
 TASKS_PER_THREAD = 4
-RIDGE = {"f64": 1e-13, "f32": 1e-7}
-GUARDED = {1: 2, 2: 4, 3: 4}
-"""Vectors that the inverse iteration carries for so many solutions; the guards are what makes it converge."""
-GAP = {"f64": 1e-6, "f32": 1e-3}
-DENOISE = {"ols": 0.0, "tls": 0.0, "tls-equilibrated": 0.9}
-"""Share of the gradients' own noise that the covariances take out of J_ff; OLS divides by J_ff as it is, and the
-residual of raw TLS is no bound for the eigenvalues of the equilibrated tensor.
-
-What noise adds to J_ff is no structure. Taking nearly all of it leaves the matrix definite where there is nothing else,
-and makes the standard errors there ten times larger.
-"""
-MODEL_ERROR = {"1": 0.0, "x": 0.05, "y": 0.05, "sx": 0.03, "sy": 0.03, "t": 0.05, "range": 0.03}
-TURNING_ERROR = 0.01
-"""What each equation of the motion fit leaves out: a share of the sizes of its terms, by the offset of its row; and
-of the mixed derivatives ``a_s`` and ``b_t`` also a share of ``nu |Ω| (1 + ZX² + ZY²)^1/2``.
-
-Noise is not all: on steep and turning surfaces the affine model's derivatives are off by some per cent without any, the
-mixed ones in proportion to the turning (a_s by .0026 of the above on a 60° face), while the flow itself is not.
-Weights that know of the noise alone stake everything on the derivatives where images are good. That ``a_s`` and ``b_t``
-measure one derivative from the same noise, which the weights leave out, is one more reason for a share.
-"""
-STEP_SIZE = {"f64": 1e-7, "f32": 3e-3}
-"""Relative step of the forward differences of the motion rows: about the root of the rounding."""
-MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
-"""Least energy of the gradient relative to that of the image, (8 eps)²: below, it is the rounding of a constant."""
-MIN_MASS = 0.2
-"""Least share of the window's weight that must lie inside the images (a corner pixel has 1/4)."""
-MAX_RESIDUAL_PX = 0.5
-"""Root mean square misfit of the brightness constraint, as a displacement, above which a window is incoherent."""
-
-
-def _solution_noise(
-    sampling: Sampling, columns: ColumnSet, scale: NDArray[np.float64]
-) -> tuple[list[NDArray[np.float64]], tuple[NoiseTerm, ...]]:
-    """Each solution's noise: ratios (packed), then the values of the terms that centred squares add; and the terms."""
-    lower = np.tril_indices(columns.n_flow)
-    found = [noise_ratio(sampling, columns, a) for a in columns.solutions]
-    values = [np.array([t.value * scale[t.a] * scale[t.b] for t in terms]) for _, terms in found]
-    return [*(ratio[lower] for ratio, _ in found), *values], found[0][1]
-
-
-def _packed(a: int, b: int) -> int:
-    """Position of an element of a symmetric matrix in its packed lower triangle."""
-    r, c = max(a, b), min(a, b)
-    return r * (r + 1) // 2 + c
-
-
-@dataclass(frozen=True)
-class View:
-    """Camera and output grid of one band: pixel (row, col) lies at (x + step col, y + step row)."""
-
-    f_px: float
-    principal_px: tuple[float, float]
-    baseline_mm: tuple[float, float]
-    shift_px: tuple[float, float]
-    x: int
-    y: int
-    step: int
-    rows: int
-    cols: int
-    pitch: int
-
-
-@dataclass
-class _Tables:
-    """The tables of one data vector."""
-
-    number: NDArray[np.int32]
-    value: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -127,35 +48,11 @@ class EstimateStage:
         apart: bool = False,
     ):  # fmt: skip
         from leafflow_ti.kernels.maps import Output
-        from leafflow_ti.kernels.spec import EXTRA_PLANES
-        from leafflow_ti.kernels.workspace import Layout
 
         self.device, self.problem, self.view, self.differences = device, problem, view, differences
         self.apart = apart or device.gpu
-        columns, own = problem.columns, problem.own_flows
-        rows = self._rows()
-        n_rows = [2 * len(problem.offsets) + problem.use_range] + ([2 * len(own.offsets)] if own else [])
-        planes = [len(layout.entries) + EXTRA_PLANES]
-        planes += [len(TensorLayout.of(own.columns).entries) + EXTRA_PLANES] * len(own.steps) if own else []
-        self._first_plane = np.cumsum([0, *planes]).tolist()
-        self.layout = Layout(
-            columns.n, columns.n_time_like, max(planes), len(rows.camera[0]) if rows.camera else 0,
-            max(len(rows.motion), *n_rows), len(problem.terms), max(n_rows),
-            max(problem.fitted, problem.unknowns + bool(own and own.growth), 3 if problem.range_scale else 1),
-            columns.n_flow if own and own.reference_rows else 0, Output.PLANES,
-        )  # fmt: skip
-        self.reference = self._reference_tables(rows, layout)
-        self._tables_of = [self.reference]
-        if own:
-            # The same rows among all unknowns.
-            final = _Tables(self.reference.number.copy(), self.reference.value)
-            self._set_numbers(final.number, CORRELATED=columns.n_flow)
-            self._set_unknowns(final.number, own.unknowns, own.growth)
-            self._tables_of += [final, *self._own_tables(own)]
-        if problem.estimator == "tls":
-            # The null space in raw units; residuals and covariances on the equilibrated tensor.
-            self._raw = len(self._tables_of)
-            self._tables_of += [_Tables(t.number.copy(), self.unscaled(t.value)) for t in self._tables_of]
+        self._tables = ProblemTables(device, problem, layout)
+        self.layout = self._tables.layout
         self._steps = self._make_steps()
         self.set_view(view)
         lanes, n_pixels = device.dense.lanes, view.rows * view.pitch
@@ -174,182 +71,19 @@ class EstimateStage:
         self._workspace = device.empty(places * self.layout.n_elements * lanes, "algebra")
         self._maps = device.empty(Output.PLANES * n_pixels)
 
-    def _rows(self) -> SimpleNamespace:
-        """Columns of the motion rows and of each camera solution's geometry rows; brightness rows stand last."""
-        problem, columns = self.problem, self.problem.columns
-
-        def both(own: str, offsets: Sequence[str], brightness: Sequence[str]) -> list[int]:
-            other = "y" if own == "x" else "x"
-            found = [columns.index(c, o) for c in (own, other) for o in offsets]
-            found += [columns.index("i", o) for o in brightness]
-            return [i for i in found if i is not None]
-
-        motion = both("x", problem.offsets, problem.brightness) if "t" in columns.solutions else []
-        if problem.range_scale is not None:
-            motion.insert(2, 2)  # the column of W, behind those of U' and V'
-        camera = [both("x" if a == "sx" else "y", problem.terms, ["1"]) for a in problem.camera_axes]
-        return SimpleNamespace(motion=motion, camera=camera)
-
-    @staticmethod
-    def _set_numbers(number: NDArray[np.int32], **entries: int) -> None:
-        from leafflow_ti.kernels.workspace import Number
-
-        for name, entry in entries.items():
-            number[Number[name]] = entry
-
-    @staticmethod
-    def _set_unknowns(number: NDArray[np.int32], n: int, growth: bool = False) -> None:
-        """The unknowns are the first ``n`` components of (N, Ω, A), and the growth behind them."""
-        from leafflow_ti.kernels.patch import GROWTH
-        from leafflow_ti.kernels.workspace import Number
-
-        number[Number.UNKNOWNS] = n + growth
-        number[Number.PLACE : Number.PLACE + n] = range(n)
-        if growth:
-            number[Number.PLACE + GROWTH] = n
-
-    def _tables(
-        self, columns: ColumnSet, sampling: Sampling, layout: TensorLayout, offsets: Sequence[str], rows: Sequence[int]
-    ) -> _Tables:
-        """What the tables of every data vector hold: columns, noise, the motion rows."""
-        from leafflow_ti.kernels.patch import RANGE_CODE
-        from leafflow_ti.kernels.workspace import Number, Region, Value
-
-        problem, precision = self.problem, self.device.algebra
-        noise = column_noise(sampling, columns)
-        ratios, terms = _solution_noise(sampling, columns, noise**-0.5)
-        number = np.full(Number.LOWER + len(layout.lower) + 2 * len(terms), -1, np.int32)
-        value = np.concatenate([np.zeros(Value.RATIO), *ratios])
-        number[: len(Region)] = self.layout.offsets
-        self._set_numbers(
-            number, N=columns.n, SOLUTIONS=columns.n_time_like, FLOW=columns.n_flow, ITERATIONS=problem.iterations,
-            BLOCK=GUARDED[columns.n_time_like], FIRST_PLANE=0,
-            MOTION_SOLUTION=columns.n_time_like - 1 if "t" in columns.solutions else -1, TERMS=len(problem.terms),
-            OFFSETS=len(offsets), ROWS_T=len(rows), ROWS_S=0, USE_RANGE=0, UNKNOWNS=0, WEIGHTED=problem.weighted,
-            BRIGHTNESS_COLUMN=-1, BRIGHTNESS_ROWS=0, WORLD_MAPS=0, RANGE_TERM=-1, CAMERA_SOLUTIONS=0, CROSS_TERMS=0,
-            OWN_FLOW=0, CORRELATED=0, EXTRA=len(layout.entries), CENTRE_TERMS=len(columns.at_centre),
-            NOISE_TERMS=len(terms), MOTION_FLOW=len(rows),
-        )  # fmt: skip
-        for j, (constant, square, factor) in enumerate(columns.at_centre):
-            number[Number.CENTRE + 2 * j : Number.CENTRE + 2 * j + 2] = constant, square
-            value[Value.CENTRE + j] = factor
-        flow_rows = [i for c in ("x", "y") if (i := columns.index(c)) is not None]
-        number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = flow_rows
-        for i, o in enumerate(offsets):
-            number[Number.OFFSET_CODES + i] = 0 if o == "1" else 1 + AXES.index(o)
-        number[Number.MOTION_ROWS : Number.MOTION_ROWS + len(rows)] = rows
-        lower = Number.LOWER + len(layout.lower)
-        number[Number.LOWER : lower] = layout.lower
-        number[lower:] = [n for t in terms for n in (_packed(t.a, t.b), layout.lower[_packed(t.base_a, t.base_b)])]
-        value[Value.RIDGE], value[Value.GAP], value[Value.STEP_SIZE] = (t[precision] for t in (RIDGE, GAP, STEP_SIZE))
-        value[Value.SCALE : Value.SCALE + columns.n] = noise**-0.5
-        value[Value.NOISE : Value.NOISE + columns.n] = noise
-        value[Value.GAIN] = noise[flow_rows[0]]
-        value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
-        value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
-        value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
-        for code, name in enumerate(("1", *AXES, "range")):
-            value[Value.MODEL_ERROR + code] = MODEL_ERROR[name]
-        assert len(AXES) + 1 == RANGE_CODE
-        value[Value.TURNING_ERROR] = TURNING_ERROR
-        value[Value.SECOND_MOMENT : Value.SECOND_MOMENT + 2] = sampling.x.moment(2), sampling.y.moment(2)
-        # Windows that do not overlap from one frame to the next share no content that could be followed.
-        value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size)
-        value[Value.DENOISE] = DENOISE[problem.estimator]
-        return _Tables(number, value)
-
-    def _reference_tables(self, rows: SimpleNamespace, layout: TensorLayout) -> _Tables:
-        from leafflow_ti.kernels.maps import Output
-        from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Value
-
-        problem, columns, sampling = self.problem, self.problem.columns, self.problem.sampling
-        tables = self._tables(columns, sampling, layout, problem.offsets, rows.motion)
-        number, value = tables.number, tables.value
-        brightness = columns.index("i")
-        self._set_numbers(
-            number, ROWS_S=len(rows.camera[0]) if rows.camera else 0, USE_RANGE=problem.use_range,
-            BRIGHTNESS_COLUMN=-1 if brightness is None else brightness,
-            BRIGHTNESS_ROWS=len(problem.brightness), MOTION_FLOW=len(rows.motion) - len(problem.brightness),
-            WORLD_MAPS=len(problem.world_brightness), CAMERA_SOLUTIONS=len(problem.camera_axes),
-            RANGE_TERM=problem.terms.index("t") if "t" in problem.terms else -1,
-        )  # fmt: skip
-        self._set_unknowns(number, problem.fitted)
-        value[Value.MOTION_SCALE : Value.MOTION_SCALE + 2] = problem.range_scale or (0.0, 0.0)
-        planes = [Output[BRIGHTNESS_MAPS[o].upper()] - Output.BRIGHTNESS_T for o in problem.brightness]
-        number[Number.BRIGHTNESS_PLANES : Number.BRIGHTNESS_PLANES + len(planes)] = planes
-        for k, axis in enumerate(problem.camera_axes):
-            number[Number.CAMERA_AXIS + k] = 0 if axis == "sx" else 1
-            at = Number.CAMERA_ROWS + k * MAX_ROWS
-            number[at : at + len(rows.camera[k])] = rows.camera[k]
-            terms = cross_noise(sampling, columns, axis, "t") if "t" in columns.solutions else ()
-            number[Number.CROSS_TERMS] = len(terms)
-            for j, term in enumerate(terms):
-                at = Number.CROSS_AB + (k * 9 + j) * 3
-                number[at : at + 3] = term.a, term.b, layout.lower[_packed(term.base_a, term.base_b)]
-                value[Value.CROSS + k * 9 + j] = term.value
-        return tables
-
-    def _own_tables(self, own: OwnFlows) -> list[_Tables]:
-        """Tables of each camera's own flow: they differ by where the camera stands."""
-        from leafflow_ti.kernels.workspace import Number, Value
-
-        columns = self.problem.columns
-        rows = [own.columns.index(c, o) for c in ("x", "y") for o in own.offsets]
-        common = self._tables(
-            own.columns, own.sampling, TensorLayout.of(own.columns), own.offsets, [i for i in rows if i is not None]
-        )
-        correlated = columns.n_flow if own.reference_rows else 0
-        self._set_numbers(common.number, OWN_FLOW=1, CORRELATED=correlated)
-        self._set_unknowns(common.number, own.unknowns, own.growth)
-        moves = [own.columns.index(c, o) for c in ("x", "y") for o in ("x", "y")]
-        common.number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
-        found = []
-        for step, first_plane in zip(own.steps, self._first_plane[1:-1], strict=True):
-            number, value = common.number.copy(), common.value.copy()
-            number[Number.FIRST_PLANE] = first_plane
-            value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
-            for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
-                number[Number.PARTNER + a] = partner
-                if partner >= 0:
-                    scales = self.reference.value[Value.SCALE + a], value[Value.SCALE + partner]
-                    value[Value.PARTNER + a] = factor * scales[0] / scales[1]
-            found.append(_Tables(number, value))
-        return found
-
     def set_view(self, view: View) -> None:
         """Move to another band of the same size."""
-        from leafflow_ti.kernels.workspace import Value
-
         self.view = view
-        factors = np.sqrt([
-            difference_variance(self.problem.sampling.axis(axis), 2 * view.step, int(offset == axis))
-            for axis in ("x", "y") for offset in ("1", *AXES, "range")
-        ])  # fmt: skip
-        for tables in self._tables_of:
-            self._set_numbers(tables.number, OUT_X=view.x, OUT_Y=view.y, STEP=view.step, PITCH=view.pitch)
-            value = tables.value
-            value[Value.F], value[Value.PX], value[Value.PY] = view.f_px, *view.principal_px
-            value[Value.BASELINE : Value.BASELINE + 2] = view.baseline_mm
-            value[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
-            value[Value.DIFFERENCE : Value.DIFFERENCE + 14] = factors
+        self._tables.aim(view)
+        tables = self._tables.tables
         numbers, values = (np.cumsum([0, *map(len, parts)]) for parts in (
-            [t.number for t in self._tables_of], [t.value for t in self._tables_of]
+            [t.number for t in tables], [t.value for t in tables]
         ))  # fmt: skip
+        steps = [n for s in self._steps for n in (s.stage, s.which, numbers[s.tables], values[s.tables])]
         self._on_device = (
-            self.device.array([n for s in self._steps for n in (s.stage, s.which, numbers[s.tables], values[s.tables])],
-                              "int"),
-            self.device.array(np.concatenate([t.number for t in self._tables_of]), "int"),
-            self.device.array(np.concatenate([t.value for t in self._tables_of]), "algebra"),
+            self.device.array(steps, "int"), self.device.array(np.concatenate([t.number for t in tables]), "int"),
+            self.device.array(np.concatenate([t.value for t in tables]), "algebra"),
         )  # fmt: skip
-
-    @staticmethod
-    def unscaled(value: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The table ``value`` with unit scales: the tensor in raw units."""
-        from leafflow_ti.kernels.workspace import MAX_COLUMNS, Value
-
-        raw = value.copy()
-        raw[Value.SCALE : Value.SCALE + MAX_COLUMNS] = 1.0
-        return raw
 
     def _make_steps(self) -> list[_Step]:
         """What is done to every group of pixels."""
@@ -364,7 +98,7 @@ class EstimateStage:
 
         def solve(tables: int) -> None:
             for stage, raw in ESTIMATORS[problem.estimator](problem.solver):
-                add(stage, tables=tables + self._raw if raw else tables)
+                add(stage, tables=tables + self._tables.raw if raw else tables)
             add(Stage.CLEAN, tables=tables)
 
         errors = COVARIANCE | (DIFFERENCES if self.differences else 0)
@@ -385,15 +119,15 @@ class EstimateStage:
         add(Stage.MEASURED)
         if own:
             if own.reference_rows:
-                add(Stage.PATCH_FIT, CLEAR | errors, 1)
+                add(Stage.PATCH_FIT, CLEAR | errors, ProblemTables.FINAL)
             for i in range(len(own.steps)):
-                solve(2 + i)
-                add(Stage.ROW_COVARIANCE, 0, 2 + i)
+                solve(ProblemTables.OWN + i)
+                add(Stage.ROW_COVARIANCE, 0, ProblemTables.OWN + i)
                 clear = CLEAR if i == 0 and not own.reference_rows else 0
                 finish = FINISH if i == len(own.steps) - 1 else 0
-                add(Stage.PATCH_FIT, clear | errors | finish, 2 + i)
+                add(Stage.PATCH_FIT, clear | errors | finish, ProblemTables.OWN + i)
         if problem.unknowns:
-            add(Stage.MOTION, tables=1 if own else 0)
+            add(Stage.MOTION, tables=ProblemTables.FINAL if own else 0)
         add(Stage.EMIT)
         return steps
 

@@ -10,7 +10,7 @@ from scipy.ndimage import correlate1d, minimum_filter
 
 from leafflow_ti.models import AXES, ColumnSet
 from leafflow_ti.sampling import Sampling, column_noise, cross_noise, difference_variance, noise_ratio
-from leafflow_ti.stages import estimate
+from leafflow_ti.stages.estimate_tables import DENOISE, MODEL_ERROR, TURNING_ERROR
 
 ARRAY_AXIS = {"t": 0, "sy": 1, "sx": 2, "y": 3, "x": 4}
 
@@ -316,7 +316,7 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
     surface_terms[: min(3, len(g))] = g[:3]
     k = columns.solutions.index("t")
     it = names.index("t") if "t" in names else None
-    clean = J[: columns.n_flow, : columns.n_flow] - estimate.DENOISE[problem.estimator] * np.min(variance) * np.diag(
+    clean = J[: columns.n_flow, : columns.n_flow] - DENOISE[problem.estimator] * np.min(variance) * np.diag(
         column_noise(sampling, columns)[: columns.n_flow]
     )
     inverse = np.linalg.inv(clean)
@@ -331,13 +331,13 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
             D[:, i] = -(design(surface_terms + step, q) - design(surface_terms - step, q)) @ q / (2 * step[i])
         if has_range:
             D[-1, it] += 1.0
-        floor = np.array([estimate.MODEL_ERROR[code] for code in codes]) * (np.abs(A) @ np.abs(q))
+        floor = np.array([MODEL_ERROR[code] for code in codes]) * (np.abs(A) @ np.abs(q))
         Z0, ZX, ZY, _ = surface(x0, y0, f, *surface_terms)
         turning = f / Z0 * np.linalg.norm(q[3:6]) * np.sqrt(1 + ZX**2 + ZY**2)
         for i, code in enumerate(codes):
             if code in ("sx", "sy", "range"):
                 steps = {"sx": abs(baseline[0]), "sy": abs(baseline[1]), "range": 1.0}[code]
-                floor[i] += estimate.TURNING_ERROR * turning * steps
+                floor[i] += TURNING_ERROR * turning * steps
         return A, value, C, D, shared, np.diag(floor**2), codes
 
     def reference_rows(q):
@@ -358,7 +358,7 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
     def own_rows(step, J_own, rho_own, q):
         flows = problem.own_flows
         p, s2 = solve(J_own, flows.columns, flows.sampling, problem.estimator)
-        C = covariances(J_own, s2, flows.columns, flows.sampling, rho_own, estimate.DENOISE[problem.estimator])[0, 0]
+        C = covariances(J_own, s2, flows.columns, flows.sampling, rho_own, DENOISE[problem.estimator])[0, 0]
         rows = [flows.columns.index(d, o) for d in ("x", "y") for o in flows.offsets]
         E = np.eye(flows.columns.n_flow)[rows]
         moved = [step[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
@@ -378,7 +378,7 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         found = rows_of(E @ p[:, 0], E @ C @ E.T, np.zeros((len(g), len(rows))), design, codes, False, q)
         n = flows.columns.n_flow
         noise = np.diag(column_noise(flows.sampling, flows.columns)[:n])
-        own_inverse = np.linalg.inv(J_own[:n, :n] - estimate.DENOISE[problem.estimator] * s2[0] * noise)
+        own_inverse = np.linalg.inv(J_own[:n, :n] - DENOISE[problem.estimator] * s2[0] * noise)
         shared = shared_covariance(
             J_own, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
         ) * (rho_own * np.sqrt(variance[k] * s2[0]))
@@ -448,7 +448,7 @@ def measure(J, rho, problem, view, x, y, own=()):
     """
     columns, sampling = problem.columns, problem.sampling
     P, variance = solve(J, columns, sampling, problem.estimator)
-    cov = covariances(J, variance, columns, sampling, rho, estimate.DENOISE[problem.estimator])
+    cov = covariances(J, variance, columns, sampling, rho, DENOISE[problem.estimator])
     P, cov = at_centre(P, cov, columns)
     x0, y0, f = x - view.principal_px[0], y - view.principal_px[1], view.f_px
     found = {}
@@ -506,7 +506,7 @@ def velocity_differences(J, rho, problem, view, x, y, own=()):
     """Covariances of the velocity's central differences: name -> (value, geometric mean of its variances)."""
     columns, sampling = problem.columns, problem.sampling
     P, variance = solve(J, columns, sampling, problem.estimator)
-    cov = covariances(J, variance, columns, sampling, rho, estimate.DENOISE[problem.estimator])
+    cov = covariances(J, variance, columns, sampling, rho, DENOISE[problem.estimator])
     geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
     x0, y0 = x - view.principal_px[0], y - view.principal_px[1]
     _, (_, *spreads), _ = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
