@@ -151,13 +151,8 @@ def test_windows_of_blocks_measure_as_well_as_smooth_ones() -> None:
     smooth, blocks = (lf.estimate(capture, **OPTIONS, stride=stride, roi=roi) for stride in (1, 4))
     exact = plane.truth(SINUSOID)
     at = tuple(np.ix_(blocks.y, blocks.x))
-    for quantity in (
-        "depth",
-        "slope_x",
-        "slope_y",
-        *(f"velocity_{a}" for a in "xyz"),
-        *(f"rotation_{a}" for a in "xyz"),
-    ):
+    vectors = [f"{quantity}_{axis}" for quantity in ("velocity", "rotation") for axis in "xyz"]
+    for quantity in ("depth", "slope_x", "slope_y", *vectors):
         one, other, std = smooth[quantity][::4, ::4], blocks[quantity], blocks[f"{quantity}_std"]
         assert np.max(np.abs(one - other) / std) <= 0.5, quantity
         np.testing.assert_allclose(std, smooth[f"{quantity}_std"][::4, ::4], rtol=0.03)
