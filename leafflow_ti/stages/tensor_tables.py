@@ -16,8 +16,9 @@ from leafflow_ti.stages.windows import Windows, block_weights, taps, x_powers
 Ints = list[int]
 ALL_ROWS = 1 << 30
 """Slots of what keeps every row."""
-SCRATCH_BYTES = 1 << 20
-"""Of one task on the CPU, in single precision, so that it stays in a core's second cache."""
+SCRATCH_BYTES = 2 << 20
+"""Most of one task on the CPU, in single precision: what a row works with then stays in a core's second cache (the
+whole need not: measured, wider tiles with less overlap are worth more)."""
 WIDEST, NARROWEST = 64, 8
 """Columns of a tile: as many as the scratch has room for."""
 
