@@ -277,6 +277,7 @@ class TensorStage:
         )  # fmt: skip
 
 
+@functools.lru_cache(maxsize=64)
 def band_bytes(
     columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int,
     own: Sequence[Request] = (), gpu: bool = False,
