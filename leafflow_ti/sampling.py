@@ -47,6 +47,7 @@ class Blocks:
         return np.asarray(self.step * (np.arange(len(self.weights)) - (len(self.weights) - 1) / 2), np.float64)
 
     @classmethod
+    @functools.lru_cache(maxsize=64)
     def of(cls, size: int, moment: float, stride: int) -> Blocks | None:
         """Blocks for outputs at distance ``stride`` in place of a window of ``size`` samples; None: no such blocks.
 

@@ -185,7 +185,7 @@ def test_the_memory_plan_holds_the_arrays(device: Callable, stride: int) -> None
     stage = TensorStage(d, columns, TensorLayout.of(columns), sampling, band, own)
     arrays = [a for a in vars(stage).values() if getattr(a, "dtype", None) == np.float32]
     taken = sum(a.nbytes for a in arrays)
-    planned = band_bytes(columns, TensorLayout.of(columns), sampling, band, 4, own)
+    planned = band_bytes(columns, TensorLayout.of(columns), sampling, band, 4, tuple(own))
     # The plan does not know how many tasks share the scratch, and counts the output of the next stage.
     assert 0.5 * planned < taken <= planned
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import test_kernels_tensor
 import test_range_flow
 from reference import chain
 from test_prefilter import assert_equals_twin
@@ -50,7 +51,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(PREFILTERS) + 4} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(PREFILTERS) + 6} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -97,6 +98,11 @@ def on_vulkan_the_chain_equals_the_twin(
             map_value, map_std = (m[pixel] for m in found.map(name))
             assert abs(map_value - value) <= limit.maps * std, name
             assert map_std == pytest.approx(std, rel=limit.errors), name
+
+
+@pytest.mark.parametrize(("size", "stride"), [(31, 3), (37, 4)])
+def on_vulkan_windows_of_blocks_equal_direct_sums(make_bench: Callable, size: int, stride: int) -> None:
+    test_kernels_tensor.test_windows_of_blocks_equal_direct_sums(make_bench, "affine-4d", size, stride, "f32")
 
 
 @pytest.mark.parametrize("kind", PREFILTERS)

@@ -241,8 +241,8 @@ class Channels:
         need = dict.fromkeys(self.finals, (0, 0))
         found = []
         for axis in reversed(order):
-            # Planes of one image follow each other: their sources are then in the cache.
-            found.append(Pass(axis, dict(sorted(need.items()))))
+            # Planes of one image follow each other: their sources are then in the cache. Invalid pixels come first.
+            found.append(Pass(axis, dict(sorted(need.items(), key=lambda item: (item[0].row != INVALID, item[0])))))
             before: dict[Plane, tuple[int, int]] = {}
             for plane, (ry, rx) in need.items():
                 r = len(self.kernel(axis, getattr(plane, axis))) // 2

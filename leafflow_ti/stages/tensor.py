@@ -68,6 +68,7 @@ class TensorStage:
         self._starts = np.cumsum([0, *sizes[5:]]) * lanes
         self.tensors = self._zeros(int(self._starts[-1]))
         self._filter_tables = self._device_tables(lowered)
+        self._clean_tables = self._tables_without_invalid(lowered)
         self._window_tables = [self._device_windows(w) for w in lowered.windows]
         self._spoilt = np.zeros(self.n_taps, bool)
         self.reset()
@@ -100,6 +101,12 @@ class TensorStage:
             array([w for _, weights, *_ in groups for w in weights]), array([c for *_, c, _ in groups]),
             array([i for *_, i in groups], "int"),
         )  # fmt: skip
+
+    def _tables_without_invalid(self, lowered: Lowered) -> tuple[Any, ...]:
+        """The same for frames without invalid pixels."""
+        array = self.device.array
+        zeros = [lowered.zero] * len(lowered.groups)
+        return (array(lowered.steps_without_invalid, "int"), *self._filter_tables[1:-1], array(zeros, "int"))
 
     def _device_windows(self, windows: Windows) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...], int]:
         """Of one request: sums over frames with their sets, windows along x, windows along y, the number of sets."""
@@ -200,10 +207,11 @@ class TensorStage:
         device, lowered = self.device, self._lowered
         g = lowered.geometry
         arrays = (device.vectors(a, g.lanes) for a in (self._raw, self._scratch, self._maps))
+        tables = self._filter_tables if self._spoilt.any() else self._clean_tables
         tile_kernel(device.moments)(
             len(lowered.steps), lowered.n_raw, lowered.n_early, g.n_tiles, self._n_tiling, lowered.raw_row,
             g.map_rows, g.halo[0], self._pushed % self.n_taps, g.y.step, g.y.length, g.map_tile, maps_at,
-            lowered.scratch, g.halo[1], -(-g.inner // UNROLLED), *self._filter_tables, *arrays,
+            lowered.scratch, g.halo[1], -(-g.inner // UNROLLED), *tables, *arrays,
         )  # fmt: skip
 
     def _make_tensor(self, number: int) -> None:
@@ -277,9 +285,10 @@ class TensorStage:
         )  # fmt: skip
 
 
+@functools.lru_cache(maxsize=64)
 def band_bytes(
     columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int,
-    own: Sequence[Request] = (), gpu: bool = False,
+    own: tuple[Request, ...] = (), gpu: bool = False,
 ) -> int:  # fmt: skip
     """Memory of the arrays of one band, from raw frames to output maps; a GPU keeps whole planes of every step."""
     lowered = Lowered(*_tables((Request(columns, layout, sampling), *own)), band, 1 if gpu else MOMENT_LANES)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.sampling import Sampling
-from leafflow_ti.stages.channels import INVALID_SEEN, POWERS, UNROLLED, Channels, MapKey, Pass, Plane
+from leafflow_ti.stages.channels import INVALID, INVALID_SEEN, POWERS, UNROLLED, Channels, MapKey, Pass, Plane
 from leafflow_ti.stages.planes import Terms, round_up
 from leafflow_ti.stages.windows import Windows, block_weights, taps, x_powers
 
@@ -154,16 +154,19 @@ class Lowered:
         widest = 0 if products else max(self.linear.blocks[first : first + n])
         outputs = [target.base, target.plane, target.slots, target.hop]
         self.steps.append([products, first, first + n, slots, hop, column_step, *outputs, widest])
+        self._about_invalid.append(0)
 
     def _lay_out(self, geometry: Geometry) -> None:
         self.geometry = geometry
         # Filters look a little to the left of what a tile needs: room for that before the first plane.
         self.scratch = self.geometry.width if self.gpu else 0
         self.steps: list[Ints] = []
+        self._about_invalid: Ints = []
         self.linear = Linear()
         self._n_linear = self._n_groups = 0
         self._lay_out_blocks(*self._lay_out_products(self._lay_out_filters()))
-        self.scratch += self.geometry.width
+        self.zero = self.scratch
+        self.scratch += 2 * self.geometry.width
 
     def _lay_out_filters(self) -> dict[Plane, int]:
         """Steps of the passes along t, y, x and the camera axes; the places of the channels.
@@ -224,6 +227,19 @@ class Lowered:
             ry, rx = one.outputs[plane]
             self.linear.add(terms, g.halo[1] - rx, g.inner + 2 * rx, g.halo[0] - ry if early else 0)
         self._step(len(planes), source, target)
+        self._about_invalid[-1] = n = sum(plane.row == INVALID for plane in planes)
+        assert all(plane.row == INVALID for plane in planes[:n])
+
+    @property
+    def steps_without_invalid(self) -> list[Ints]:
+        """The steps without the outputs that count invalid pixels, which come first: where there are none, the plane
+        of zeros at ``zero`` stands for them."""
+        found = []
+        for (products, first, last, slots, hop, column_step, target, plane, *rest), n in zip(
+            self.steps, self._about_invalid, strict=True
+        ):
+            found.append([products, first + n, last, slots, hop, column_step, target + n * plane, plane, *rest])
+        return found
 
     def _lay_out_products(self, places: dict[Plane, int]) -> tuple[dict[MapKey, int], Region]:
         """Derived channels, then maps; the places of the maps."""
