@@ -39,8 +39,8 @@ class Engine:
         """The kept stages if they are the ones, else new ones. ``view``: of an output of a given pitch."""
         problem, filters = plan.problem, plan.config.filters
         key = (device, problem, plan.layout, band, bool(plan.margin), filters.prefilter, filters.sigma_pre, apart)
-        kept = None if plan.ranges else _take(key)
-        if kept is not None:
+        kept = _take(key)
+        if kept is not None and not plan.ranges:
             return kept
         own = problem.own_flows.requests if problem.own_flows else ()
         tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band, own)
@@ -67,9 +67,11 @@ _lock = threading.Lock()
 
 
 def _take(key: tuple[Any, ...]) -> Engine | None:
-    """The kept stages, which are then no longer kept: two estimates never share them."""
+    """The kept stages if they are the ones. Either way they are no longer kept: two estimates never share them, and
+    what does not fit gives its memory to the new ones."""
     with _lock:
-        return _kept.pop() if _kept and _kept[0].key == key else None
+        engine = _kept.pop() if _kept else None
+    return engine if engine is not None and engine.key == key else None
 
 
 def keep(engine: Engine, plan: Plan) -> None:

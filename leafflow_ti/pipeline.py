@@ -122,6 +122,10 @@ class Pipeline:
         for engine in self._engines.values():
             keep(engine, self.plan)
 
+    def release(self) -> None:
+        """Give back the memory of the stages; they are made again when needed."""
+        self._engines.clear()
+
     def _measurable(self, axis: str, positions: range, size: int, pair: int) -> slice:
         """Output rows or columns whose window (``border`` "full") or centre ("clip") lies inside all images.
 

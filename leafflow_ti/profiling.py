@@ -170,6 +170,7 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
     work = {stage: one * computed for stage, one in count_work(plan).items()}
     spent = {**steps.stages, **background}
     if "estimate" in spent:
+        pipeline.release()  # the memory that is planned is enough for one
         solving = _share_of_solving(plan, capture, device, band)
         for times in (spent, least):
             whole = times.pop("estimate")

@@ -329,3 +329,40 @@ def test_steps_launched_apart_give_the_same_bits(bench: Callable, model: str) ->
     for name in ("disparity", "depth", "slope_x", "slope_y", "flow_x", "flow_y", *(f"velocity_{a}" for a in "xyz")):
         for one, other in zip(together.map(name), apart.map(name), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_kept_stages_measure_as_new_ones(capture: Capture) -> None:
+    """Stages that have seen other images, invalid pixels among them, and another region give the same bits."""
+    from leafflow_ti import engines
+
+    options = OPTIONS | {"model": "affine-scene-flow", "frame": 6, "roi": (14, 10, 46, 34)}
+    images = capture.block(range(13), (0,), range(5), 0, 43, 0, 61, (0, 0), np.float32)
+    spoilt = images.copy()
+    spoilt[6, 0, 2, 20, 30] = np.nan
+    clean, holed = (capture_from_array(i, capture.geometry) for i in (images, spoilt))
+
+    def measure(seen: Capture, **other: object) -> lf.Field:
+        return lf.estimate(seen, **{**options, **other})
+
+    wanted = []
+    for seen in (clean, holed):
+        lf.release()
+        wanted.append(measure(seen))
+    assert (wanted[1].status == Status.OK).sum() < (wanted[0].status == Status.OK).sum()
+    lf.release()
+    measure(clean)
+    used = engines._kept[0]
+    for seen, field in zip((holed, clean, holed), (wanted[1], wanted[0], wanted[1]), strict=True):
+        found = measure(seen)
+        assert engines._kept[0] is used
+        np.testing.assert_array_equal(found.status, field.status)
+        for name in field:
+            np.testing.assert_array_equal(found[name], field[name])
+    # The same size elsewhere: the stages move; another size needs its own, and the old ones are gone.
+    moved = measure(clean, roi=(16, 12, 48, 36))
+    assert engines._kept[0] is used
+    np.testing.assert_array_equal(moved["depth"][:-2, :-2], wanted[0]["depth"][2:, 2:])
+    measure(clean, roi=(14, 10, 46, 32))
+    assert engines._kept[0] is not used
+    lf.release()
+    assert not engines._kept

@@ -13,6 +13,7 @@ import numpy as np
 BLOCK = 4
 """Most vectors that the block inverse iteration carries: the solutions and at least one guard."""
 MAX_UNKNOWNS = 10
+"""Components (N, Ω, A, ε) of the motion."""
 PATCH_SIZE = 12
 MAX_ROWS = 16
 MAX_COLUMNS = 32
@@ -53,7 +54,7 @@ class Region(IntEnum):
     GEOMETRY_COV = auto()  # [G, G]
     GEOMETRY_CROSS = auto()  # [G, T]
     GEOMETRY_WORK = auto()  # [S, G]
-    MOTION = auto()  # [Q]
+    MOTION = auto()  # [MAX_UNKNOWNS]: by component, 0 where it is no unknown
     MOTION_COV = auto()  # [Q, Q]
     DIFFERENCE_COV = auto()  # [2, Q, Q]: of difference quotients of the motion along x and y
     PATCH = auto()  # [PATCH_SIZE]: rays and surface of the patch (kernels.patch)

@@ -41,8 +41,8 @@ class TensorStage:
     """Turns a stream of frames of one band into structure tensors.
 
     ``push`` takes one frame's block [n_sy, n_sx, in_rows, in_cols] (preshifted) of the cameras that the sampling and
-    the ``own`` requests need, and its validity. Once the window is full it returns the packed tensor [n_entries +
-    EXTRA_PLANES, rows, out_pitch] as a flat device array; ``tensors`` holds it and those of the own requests, valid
+    the ``own`` requests need, and its validity. Once the window is full it returns ``tensors``, one flat
+    device array: the packed tensor [n_entries + EXTRA_PLANES, rows, out_pitch], then those of the own requests; valid
     until the next call. For ``derived`` columns the block is a stack of images [1, n_images, ...] with its factors.
     """
 
@@ -147,7 +147,7 @@ class TensorStage:
         return array(first, "int"), array(offset, "int"), array(table, "int"), array(weights)
 
     def push(self, block: NDArray[Any], valid: NDArray[np.bool_], factors: NDArray[Any] | None = None) -> Any | None:
-        """Add the next frame; the tensor of the frame ``latency`` before it, or None while the window fills.
+        """Add the next frame; the tensors of the frame ``latency`` before it, or None while the window fills.
 
         ``valid`` [in_rows, in_cols]: pixels at which every camera has a finite grey value inside its image;
         ``factors`` [FACTOR_PLANES, in_rows, in_cols]: what derived channels are multiplied by.
