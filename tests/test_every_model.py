@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reference import chain
+from reference import chain, patch
 from test_cli import call
 
 import leafflow_ti as lf
@@ -157,7 +157,7 @@ def assert_equal_to_twin(folder: Path, choice: dict[str, object], maps: dict[str
         own.append((tensor, chain.texture_smoothness(one, flows.sampling, half, half)))
     shift = tuple(float(p) for p in plan.preshift)
     view = View(geometry.f_px, geometry.principal_px, geometry.baseline_mm, shift, x, y, 4, 1, 1, 1)
-    found = chain.measure(J, rho, problem, view, x, y, own)
+    found = patch.measure(J, rho, problem, view, x, y, own)
     assert {name for name in maps if not name.endswith("_std")} - {"growth_rate"} == set(found)
     for name, (value, std) in found.items():
         # Maps are stored in single precision.

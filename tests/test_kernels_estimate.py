@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from conftest import OWN_FLOW_CASES
-from reference import chain
+from reference import chain, patch
 from tolerances import SOLVERS, tolerance
 
 from leafflow_ti.models import MODELS
@@ -63,13 +63,13 @@ def assert_maps_equal(b, found) -> None:
     for pixel in PIXELS:
         assert found.status[pixel] == Status.OK
         own = b.own_reference(*pixel) if found.problem.own_flows else ()
-        reference = chain.measure(*b.reference(*pixel), found.problem, b.view, *b.position(*pixel), own)
+        reference = patch.measure(*b.reference(*pixel), found.problem, b.view, *b.position(*pixel), own)
         for name, (value, std) in reference.items():
             map_value, map_std = (m[pixel] for m in found.map(name))
             assert abs(map_value - value) <= limit.maps * std, f"{name}: {map_value} is not {value} ± {std}"
             assert map_std == pytest.approx(std, rel=limit.errors), f"standard error of {name}"
         if found.problem.unknowns >= 3:
-            reference = chain.velocity_differences(
+            reference = patch.velocity_differences(
                 *b.reference(*pixel), found.problem, b.view, *b.position(*pixel), own
             )
             for name, (value, scale) in reference.items():

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import test_kernels_tensor
 import test_range_flow
-from reference import chain
+from reference import chain, patch
 from test_prefilter import assert_equals_twin
 from tolerances import SOLVERS, tolerance
 
@@ -93,7 +93,7 @@ def on_vulkan_the_chain_equals_the_twin(
         assert np.max(np.abs(b.tensor(*pixel) - J) / np.outer(scale, scale)) <= limit.tensor
         assert found.status[pixel] == Status.OK
         own = b.own_reference(*pixel) if found.problem.own_flows else ()
-        reference = chain.measure(J, rho, found.problem, b.view, *b.position(*pixel), own)
+        reference = patch.measure(J, rho, found.problem, b.view, *b.position(*pixel), own)
         for name, (value, std) in reference.items():
             map_value, map_std = (m[pixel] for m in found.map(name))
             assert abs(map_value - value) <= limit.maps * std, name

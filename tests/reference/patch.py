@@ -1,0 +1,368 @@
+"""Naive float64 twin of what follows the flow parameters: geometry, the fit of the motion, every map of a pixel."""
+
+import numpy as np
+from reference.chain import at_centre, covariances, solution_noise, solve
+
+from leafflow_ti.models import AXES, ColumnSet
+from leafflow_ti.sampling import column_noise, difference_variance
+from leafflow_ti.stages.estimate_tables import DENOISE, MODEL_ERROR, TURNING_ERROR
+
+
+def fit_geometry(P, cov, columns: ColumnSet, baseline, shift, weighted=True):
+    """Least-squares (nu, b_x, b_y, b_t) per mm from every camera solution, vertical disparities being zero.
+
+    Returns names, values [m], covariance [m, m], covariance with the parameters of the motion [m, n_flow] or None.
+    """
+    names = [o for o in ("1", "x", "y", "t") if columns.index("x", o) is not None]
+    m = len(names)
+    last = columns.solutions.index("t") if "t" in columns.solutions else None
+    normal, rhs, spread, cross = np.zeros((m, m)), np.zeros(m), np.zeros((m, m)), np.zeros((m, columns.n_flow))
+    for k, axis in enumerate(columns.solutions):
+        if axis == "t":
+            continue
+        own, other = ("x", "y") if axis == "sx" else ("y", "x")
+        step = baseline[0 if axis == "sx" else 1]
+        rows = [columns.index(own, o) for o in names] + [columns.index(other, o) for o in names]
+        value = P[rows, k].copy()
+        value[0] += shift[0 if axis == "sx" else 1]
+        A = np.vstack([step * np.eye(m), np.zeros((m, m))])
+        C = cov[k, k][np.ix_(rows, rows)]
+        W = np.linalg.inv(C) if weighted else np.eye(2 * m)
+        normal += A.T @ W @ A
+        rhs += A.T @ W @ value
+        spread += A.T @ W @ C @ W @ A
+        if last is not None:
+            cross += A.T @ W @ cov[k, last][rows]
+    inverse = np.linalg.inv(normal)
+    return names, inverse @ rhs, inverse @ spread @ inverse, inverse @ cross
+
+
+def surface(x0, y0, f, nu, b1=0.0, b2=0.0):
+    """Z0, ZX, ZY, c of Eq. (6.13), (6.14); x0, y0 from the principal point."""
+    Z0 = -f / nu
+    p, q = b1 * Z0, b2 * Z0
+    c = 1 / (1 + p * x0 / f + q * y0 / f)
+    return Z0, c * p, c * q, c
+
+
+def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 0.0)):
+    """Design [rows, 10] by (N, Ω, A, ε) of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
+
+    Rows run over the directions, then the offsets. The s-offsets are per camera step at the preshifted pixel.
+    ``moments`` (x, y): second moments of the window, of which the flow's own rows see the second derivatives.
+    """
+    nu, b1, b2 = geometry
+    Z0, ZX, ZY, c = surface(x0, y0, f, nu, b1, b2)
+    N = np.zeros(3)
+    N[: min(3, len(q))] = q[:3]
+    Zt = N[2] - ZX * N[0] - ZY * N[1]
+    e = np.array([[1, 0, -x0 / f], [0, 1, -y0 / f]])
+    delta = {
+        "x": Z0 / (f * c) * np.array([1 - ZY * y0 / f, ZX * y0 / f, ZX]),
+        "y": Z0 / (f * c) * np.array([ZY * x0 / f, 1 - ZX * x0 / f, ZY]),
+        "sx": np.array([c + ZX * x0 / f, ZX * y0 / f, ZX]) / c,
+        "sy": np.array([ZY * x0 / f, c + ZY * y0 / f, ZY]) / c,
+        "t": Zt / (f * c) * np.array([x0, y0, f]) - N,
+    }
+    b = {
+        "x": ZX / (Z0 * c),
+        "y": ZY / (Z0 * c),
+        "sx": f * ZX / (Z0**2 * c),
+        "sy": f * ZY / (Z0**2 * c),
+        "t": f * Zt / (Z0**2 * c),
+    }
+    unit = np.eye(3)
+
+    def row(k, o):
+        r = np.zeros(10)
+        if o == "1":
+            r[:3] = -nu * e[k]
+            return r + moments[k] / 2 * second_derivative(x0, y0, f, (Z0, ZX, ZY), k)
+        r[:3] = -b[o] * e[k]
+        if (o, k) in (("x", 0), ("y", 1)):
+            r[2] += nu / f
+        for j in range(3):
+            r[3 + j] = -nu * e[k] @ np.cross(unit[j], delta[o])
+        r[9] = -nu * e[k] @ delta[o]
+        if o == "t":
+            r[6:9] = -nu * e[k]
+        return r
+
+    def measured(k, o):
+        if o == "sx":
+            return baseline[0] * row(k, "sx") + shift[0] * row(k, "x")
+        if o == "sy":
+            return baseline[1] * row(k, "sy") + shift[1] * row(k, "y")
+        return row(k, o)
+
+    return np.array([measured(k, o) for k in (0, 1) for o in offsets])
+
+
+def second_derivative(x0, y0, f, plane, k):
+    """Coefficients [10] of (N, Ω, A, ε) of ∂²u_k/∂x_k² on the plane (Z0, ZX, ZY) at (x0, y0), by exact differences.
+
+    The flow of a rigidly moving plane is quadratic in x and y, so second differences of any width are exact.
+    """
+    Z0, ZX, ZY = plane
+    X0 = Z0 * np.array([x0 / f, y0 / f, 1.0])
+
+    def flow(d, q):
+        x, y = (x0 + d, y0) if k == 0 else (x0, y0 + d)
+        ray = np.array([x / f, y / f, 1.0])
+        X = (Z0 - ZX * X0[0] - ZY * X0[1]) / (1 - ZX * ray[0] - ZY * ray[1]) * ray
+        U = q[:3] + np.cross(q[3:6], X - X0) + q[9] * (X - X0)
+        return f * (U[k] - ray[k] * U[2]) / X[2]
+
+    h = 0.05 * f
+    return np.array([(flow(h, q) - 2 * flow(0, q) + flow(-h, q)) / h**2 for q in np.eye(10)])
+
+
+def range_row(x0, y0, f, geometry):
+    """Design [10] of the range constraint for b_t (5.23)."""
+    Z0, ZX, ZY, c = surface(x0, y0, f, *geometry)
+    r = np.zeros(10)
+    r[:3] = f / (Z0**2 * c) * np.array([-ZX, -ZY, 1.0])
+    return r
+
+
+def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampling, own_sampling, step):
+    """Covariance [n_flow, n_flow of the own flow], per σ² ρ, of the motion parameters of grid and camera.
+
+    The grid's normal equations hold the image of the camera at ``step`` with the weights of window and smoothing.
+    """
+    n, m = columns.n_flow, own_columns.n_flow
+    noise = solution_noise(J_own, own_columns, own_sampling, "t")
+    X = np.zeros((n, m))
+    for a, column in enumerate(columns.columns[:n]):
+        factor = 1.0
+        exponents = dict(zip(AXES, column.terms[0].exponents, strict=True))
+        for axis, k in zip(("sx", "sy"), step, strict=True):
+            weights, smooth = np.array(sampling.axis(axis).weights), sampling.axis(axis).kernel(False)
+            half, radius = len(weights) // 2, len(smooth) // 2
+            factor *= sum(
+                weights[i + half] * float(i) ** exponents[axis] * smooth[k - i + radius]
+                for i in range(-half, half + 1)
+                if abs(k - i) <= radius
+            )
+        kept = tuple(0 if axis in ("sx", "sy") else e for axis, e in exponents.items())
+        partner = [
+            b for b, c in enumerate(own_columns.columns[:m])
+            if (c.channel, c.terms[0].exponents) == (column.channel, kept)
+        ]  # fmt: skip
+        if partner:
+            X[a] = factor * noise[partner[0]]
+    return P_inverse @ X @ own_inverse
+
+
+def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()):
+    """The motion, three covariances, and the motion (N, Ω, A) from the reference's rows alone.
+
+    The covariances are those of the unknowns, and of their central differences along x and y; in a difference, a row is
+    left with less of its error: a row with an offset along that axis is a first moment of its window, all others means.
+
+    ``geometry`` is what fit_geometry returned.
+
+    ``own``: (J, ρ) of every camera's own flow, in the order of ``problem.own_flows.steps``. First comes a fit to the
+    rows of the reference model; with own flows, one more to all rows, linearised there. The rows' covariance holds the
+    noise of the motion parameters, of the geometry that the design is built from, what both have in common and what
+    cameras have in common with the reference model. The weights leave out what is common to sets of rows, and to
+    geometry and motion.
+    """
+    columns, sampling, f = problem.columns, problem.sampling, view.f_px
+    shift, baseline = view.shift_px, view.baseline_mm
+    names, g, cov_g, cross_g = geometry
+    moments = sampling.x.moment(2), sampling.y.moment(2)
+    surface_terms = np.zeros(3)
+    surface_terms[: min(3, len(g))] = g[:3]
+    k = columns.solutions.index("t")
+    it = names.index("t") if "t" in names else None
+    clean = J[: columns.n_flow, : columns.n_flow] - DENOISE[problem.estimator] * np.min(variance) * np.diag(
+        column_noise(sampling, columns)[: columns.n_flow]
+    )
+    inverse = np.linalg.inv(clean)
+
+    def rows_of(value, C, shared, design, codes, has_range, q):
+        """Design, values, own covariance, sensitivity, covariance with the geometry, what the equations leave out."""
+        A = design(surface_terms, q)
+        D = np.zeros((len(value), len(g)))
+        for i in range(min(3, len(g))):
+            step = np.zeros(3)
+            step[i] = 1e-4 * abs(g[0]) * (1 if i == 0 else 1 / f)
+            D[:, i] = -(design(surface_terms + step, q) - design(surface_terms - step, q)) @ q / (2 * step[i])
+        if has_range:
+            D[-1, it] += 1.0
+        floor = np.array([MODEL_ERROR[code] for code in codes]) * (np.abs(A) @ np.abs(q))
+        Z0, ZX, ZY, _ = surface(x0, y0, f, *surface_terms)
+        turning = f / Z0 * np.linalg.norm(q[3:6]) * np.sqrt(1 + ZX**2 + ZY**2)
+        for i, code in enumerate(codes):
+            if code in ("sx", "sy", "range"):
+                steps = {"sx": abs(baseline[0]), "sy": abs(baseline[1]), "range": 1.0}[code]
+                floor[i] += TURNING_ERROR * turning * steps
+        return A, value, C, D, shared, np.diag(floor**2), codes
+
+    def reference_rows(q):
+        rows = [columns.index(d, o) for d in ("x", "y") for o in problem.offsets]
+        value, C, shared = P[rows, k], cov[k, k][np.ix_(rows, rows)], cross_g[:, rows]
+        codes = [*problem.offsets, *problem.offsets]
+        if problem.use_range:
+            value, C = np.append(value, g[it]), np.pad(C, ((0, 1), (0, 1)))
+            shared = np.pad(shared, ((0, 0), (0, 1)))
+            codes.append("range")
+
+        def design(geometry, q):
+            A = motion_rows(x0, y0, f, geometry, problem.offsets, q, shift, baseline, moments)
+            return np.vstack([A, range_row(x0, y0, f, geometry)]) if problem.use_range else A
+
+        return rows_of(value, C, shared, design, codes, problem.use_range, q), rows
+
+    def own_rows(step, J_own, rho_own, q):
+        flows = problem.own_flows
+        p, s2 = solve(J_own, flows.columns, flows.sampling, problem.estimator)
+        C = covariances(J_own, s2, flows.columns, flows.sampling, rho_own, DENOISE[problem.estimator])[0, 0]
+        rows = [flows.columns.index(d, o) for d in ("x", "y") for o in flows.offsets]
+        E = np.eye(flows.columns.n_flow)[rows]
+        moved = [step[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
+        for r, (d, o) in enumerate((d, o) for d in ("x", "y") for o in flows.offsets):
+            if o == "1":
+                for axis, distance in zip(("x", "y"), moved, strict=True):
+                    E[r, flows.columns.index(d, axis)] += distance
+        x, y = (at + g[0] * baseline[i] * step[i] for i, at in enumerate((x0, y0)))
+
+        def design(geometry, q):
+            Z0, ZX, ZY, _ = surface(x0, y0, f, *geometry)
+            c = 1 - ZX * x / f - ZY * y / f
+            there = (-f / Z0, ZX / (Z0 * c), ZY / (Z0 * c))
+            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, moments)
+
+        codes = [*flows.offsets, *flows.offsets]
+        found = rows_of(E @ p[:, 0], E @ C @ E.T, np.zeros((len(g), len(rows))), design, codes, False, q)
+        n = flows.columns.n_flow
+        noise = np.diag(column_noise(flows.sampling, flows.columns)[:n])
+        own_inverse = np.linalg.inv(J_own[:n, :n] - DENOISE[problem.estimator] * s2[0] * noise)
+        shared = shared_covariance(
+            J_own, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
+        ) * (rho_own * np.sqrt(variance[k] * s2[0]))
+        return found, shared @ E.T
+
+    def fit(sets, which, common):
+        """Components ``which`` of (N, Ω, A, ε), covariances; ``common``: of the first set's rows with each other's."""
+        weights = []
+        for _, _, C, D, _, left_out, _ in sets:
+            weights.append(np.linalg.inv(C + D @ cov_g @ D.T + left_out) if problem.weighted else np.eye(len(C)))
+        normal = sum(A[:, which].T @ W @ A[:, which] for (A, *_), W in zip(sets, weights, strict=True))
+        gains = [np.linalg.solve(normal, A[:, which].T @ W) for (A, *_), W in zip(sets, weights, strict=True)]
+        solution = sum(G @ s[1] for G, s in zip(gains, sets, strict=True))
+        spreads = [spread_of(gains, sets, common)]
+        for axis in ("x", "y"):
+            scaled = []
+            for G, s in zip(gains, sets, strict=True):
+                left = [difference_variance(sampling.axis(axis), 2 * view.step, int(code == axis)) for code in s[6]]
+                scaled.append(G * np.sqrt(left))
+            spreads.append(spread_of(scaled, sets, common))
+        return solution, spreads
+
+    def spread_of(gains, sets, common):
+        by_geometry = sum(G @ s[3] for G, s in zip(gains, sets, strict=True))
+        spread = sum(G @ s[2] @ G.T for G, s in zip(gains, sets, strict=True)) + by_geometry @ cov_g @ by_geometry.T
+        for G, s in zip(gains, sets, strict=True):
+            part = by_geometry @ s[4] @ G.T
+            spread += part + part.T
+        for G, C in zip(gains[1:], common, strict=True):
+            part = gains[0] @ C @ G.T
+            spread += part + part.T
+        return spread
+
+    q = np.zeros(10)
+    for _ in range(problem.passes):
+        first, rows = reference_rows(q)
+        q[: problem.fitted], spreads = fit([first], list(range(problem.fitted)), [])
+    if problem.own_flows is None:
+        return q[: problem.fitted], spreads, q
+    first, rows = reference_rows(q)
+    sets, common = ([first], []) if problem.own_flows.reference_rows else ([], [])
+    for step, (J_own, rho_own) in zip(problem.own_flows.steps, own, strict=True):
+        found, shared = own_rows(step, J_own, rho_own, q)
+        if problem.own_flows.reference_rows:
+            common.append(np.pad(shared[rows], ((0, problem.use_range), (0, 0))))
+        elif sets:
+            common.append(np.zeros((len(sets[0][1]), len(found[1]))))
+        sets.append(found)
+    which = [*range(problem.own_flows.unknowns), *([9] if problem.own_flows.growth else [])]
+    return *fit(sets, which, common), q
+
+
+def measure(J, rho, problem, view, x, y, own=()):
+    """Every map of one pixel (x, y): name -> (value, standard error). ``problem``, ``view``: what the stages get.
+
+    ``own``: (J, ρ) of every camera's own flow.
+    """
+    columns, sampling = problem.columns, problem.sampling
+    P, variance = solve(J, columns, sampling, problem.estimator)
+    cov = covariances(J, variance, columns, sampling, rho, DENOISE[problem.estimator])
+    P, cov = at_centre(P, cov, columns)
+    x0, y0, f = x - view.principal_px[0], y - view.principal_px[1], view.f_px
+    found = {}
+    for k, axis in enumerate(columns.solutions):
+        for o in ("1", "x", "y", "t") if axis == "t" else ("1",):
+            i = columns.index("i", o)
+            if i is not None:
+                found[f"brightness_{axis}{o.strip('1')}"] = (-P[i, k], np.sqrt(cov[k, k, i, i]))
+        if axis == "t":
+            for a in ("x", "y"):
+                i = columns.index(a)
+                found[f"flow_{a}"] = (P[i, k], np.sqrt(cov[k, k, i, i]))
+    if not problem.camera_axes:
+        return found
+    geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
+    g, cov_g = geometry[1][:3], geometry[2][:3, :3]
+    step = view.baseline_mm[0 if problem.camera_axes[0] == "sx" else 1]
+
+    def put(name, value):
+        """A function of the geometry, its error by central differences."""
+        gradient = np.zeros(len(g))
+        for i in range(len(g)):
+            d = np.zeros(len(g))
+            d[i] = 1e-5 * abs(g[0]) * (1 if i == 0 else 1 / f)
+            gradient[i] = (value(g + d) - value(g - d)) / (2 * d[i])
+        found[name] = (value(g), np.sqrt(gradient @ cov_g @ gradient))
+
+    put("disparity", lambda g: g[0] * step)
+    put("depth", lambda g: surface(x0, y0, f, *g)[0])
+    if len(g) > 1:
+        put("slope_x", lambda g: surface(x0, y0, f, *g)[1])
+        put("slope_y", lambda g: surface(x0, y0, f, *g)[2])
+    if problem.unknowns:
+        q, (cov_q, *_), alone = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
+        names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
+        for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=False):
+            found[name] = (value, error)
+    if problem.world_brightness:
+        i = [columns.index("i", o) for o in problem.world_brightness]
+        Z0, ZX, ZY, c = surface(x0, y0, f, *g)
+        dX = Z0 / (f * c) * np.array([[1 - ZY * y0 / f, ZX * y0 / f], [ZY * x0 / f, 1 - ZX * x0 / f]])
+        A = np.zeros((len(i), len(i)))
+        A[:2, :2] = np.linalg.inv(dX)
+        if len(i) == 3:
+            Zt = alone[2] - ZX * alone[0] - ZY * alone[1]
+            drift = Zt / (f * c) * np.array([x0, y0]) - alone[:2]
+            A[2] = [*(-drift @ A[:2, :2]), 1.0]
+        values, spread = A @ -P[i, -1], A @ cov[-1, -1][np.ix_(i, i)] @ A.T
+        for name, value, variance in zip(("x", "y", "tt"), values, np.diag(spread), strict=False):
+            found[f"brightness_world_{name}"] = (value, np.sqrt(variance))
+    return found
+
+
+def velocity_differences(J, rho, problem, view, x, y, own=()):
+    """Covariances of the velocity's central differences: name -> (value, geometric mean of its variances)."""
+    columns, sampling = problem.columns, problem.sampling
+    P, variance = solve(J, columns, sampling, problem.estimator)
+    cov = covariances(J, variance, columns, sampling, rho, DENOISE[problem.estimator])
+    geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
+    x0, y0 = x - view.principal_px[0], y - view.principal_px[1]
+    _, (_, *spreads), _ = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
+    found = {}
+    for axis, C in zip(("x", "y"), spreads, strict=True):
+        for a, b in ("xx", "xy", "yy", "xz", "yz", "zz"):
+            i, j = "xyz".index(a), "xyz".index(b)
+            found[f"difference_{axis}_{a}{b}"] = (C[i, j], np.sqrt(C[i, i] * C[j, j]))
+    return found
