@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -17,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from leafflow_ti.config_values import auto_or_integer, integer, machine_memory, numbers, parse_memory
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
 
@@ -48,76 +48,11 @@ PRESETS: dict[str, dict[str, Any]] = {
 SIGMA_PER_SIZE = 19.0 / 65.0
 """Gaussian width relative to the window size in the dissertation's experiments (65 pixels, sigma 19)."""
 
-_MEMORY_UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
-_MIN_MEMORY = 64 * 2**20
-
-
-def parse_memory(value: object) -> int:
-    """Bytes of ``"8G"``, ``"512M"``, ``"1.5G"`` (binary multiples) or of a plain number; else ValueError."""
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", str(value), re.IGNORECASE)
-    if found is None:
-        raise ValueError("must be a size such as 8G, 512M or a number of bytes")
-    number = float(found[1]) if "." in found[1] else int(found[1])
-    size = int(number * _MEMORY_UNITS[found[2].upper()])
-    if size < _MIN_MEMORY:
-        raise ValueError("must be at least 64M")
-    return size
-
-
-def machine_memory() -> int:
-    """Memory [bytes] that this process may use: physical memory, or the limit of its control group where that is less.
-
-    8 GiB on systems that tell neither.
-    """
-    sizes = []
-    if hasattr(os, "sysconf"):  # not on Windows
-        sizes.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    limit = Path("/sys/fs/cgroup/memory.max")
-    if limit.is_file():
-        text = limit.read_text(encoding="ascii").strip()
-        sizes += [int(text)] if text.isdecimal() else []
-    return min(sizes, default=8 * 2**30)
-
-
-def _integer(value: object, low: int, odd: bool = False) -> int:
-    try:
-        number = int(str(value))  # via str: True and 4.5 are no integers here
-    except ValueError:
-        number = low - 1
-    if number < low or (odd and number % 2 == 0):
-        raise ValueError(f"must be an {'odd ' if odd else ''}integer >= {low}")
-    return number
-
-
-def _auto_or_integer(value: object, low: int, odd: bool = False) -> object:
-    if value == "auto":
-        return value
-    try:
-        return _integer(value, low, odd)
-    except ValueError as error:
-        raise ValueError(f'{error}, or "auto"') from None
-
-
-def _numbers(value: object, counts: tuple[int, ...], form: str) -> tuple[int, ...]:
-    """Integers of ``"1,2"``, ``[1, 2]`` or ``1``; ValueError unless there are as many as one of ``counts``."""
-    if isinstance(value, str):
-        parts: Iterable[object] = value.split(",")
-    else:
-        parts = value if isinstance(value, list | tuple) else (value,)
-    try:
-        numbers = tuple(int(str(part)) for part in parts)
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in counts:
-        raise ValueError(f"must be whole pixels {form}")
-    return numbers
-
-
 _Auto = Literal["auto"]
 _Taps = Annotated[Literal["3x1x1", "3", "5", "7"], BeforeValidator(str)]
 _AutoTaps = Annotated[Literal["auto", "3x1x1", "3", "5", "7"], BeforeValidator(str)]
-_AutoOdd = Annotated[int | _Auto, BeforeValidator(lambda v: _auto_or_integer(v, 1, odd=True))]
-_AutoCount = Annotated[int | _Auto, BeforeValidator(lambda v: _auto_or_integer(v, 1))]
+_AutoOdd = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 1, odd=True))]
+_AutoCount = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 1))]
 _Width = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -161,13 +96,13 @@ class WindowSection(_Section):
     is left of the window: values there are noisier, and less exact where the surface turns or bends.
     """
 
-    size: Annotated[int, BeforeValidator(lambda v: _integer(v, 3, odd=True))] = 65
+    size: Annotated[int, BeforeValidator(lambda v: integer(v, 3, odd=True))] = 65
     sigma: _Width = 19.0
     size_time: _AutoOdd = "auto"
     sigma_time: _Width = 1.0
     size_camera: _AutoOdd = "auto"
     sigma_camera: _Width = 1.0
-    stride: Annotated[int, BeforeValidator(lambda v: _integer(v, 1))] = 1
+    stride: Annotated[int, BeforeValidator(lambda v: integer(v, 1))] = 1
     border: Border = "full"
 
     @model_validator(mode="before")
@@ -235,7 +170,7 @@ class OutputSection(_Section):
         if value is None:
             return value
         form = "x0,y0,x1,y1 with 0 <= x0 < x1 and 0 <= y0 < y1 (x1, y1 excluded)"
-        x0, y0, x1, y1 = _numbers(value, (4,), form)
+        x0, y0, x1, y1 = numbers(value, (4,), form)
         if not (0 <= x0 < x1 and 0 <= y0 < y1):
             raise ValueError(f"must be {form}")
         return (x0, y0, x1, y1)
@@ -297,7 +232,7 @@ class RunConfig(_Section):
     def _check_preshift(cls, value: object) -> object:
         if value == "auto":
             return value
-        x, *y = _numbers(value, (1, 2), 'X or X,Y per camera step, or "auto"')
+        x, *y = numbers(value, (1, 2), 'X or X,Y per camera step, or "auto"')
         return (x, *y) if y else (x, 0)
 
     def to_toml(self) -> str:

@@ -13,10 +13,9 @@ from leafflow_ti.config import (
     RunConfig,
     WindowSection,
     load_config,
-    machine_memory,
-    parse_memory,
     resolve_model,
 )
+from leafflow_ti.config_values import machine_memory, parse_memory
 from leafflow_ti.errors import ConfigError
 
 

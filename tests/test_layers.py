@@ -18,7 +18,9 @@ PACKAGE = Path(leafflow_ti.__file__).parent
 LAYERS: dict[str, int] = {
     **dict.fromkeys(("errors", "status", "progress", "trace", "background"), 1),
     **dict.fromkeys(("kernels",), 2),
-    **dict.fromkeys(("capture", "models", "config", "geometry", "field", "filters", "sampling", "range_flow"), 3),
+    **dict.fromkeys(
+        ("capture", "models", "config", "config_values", "geometry", "field", "filters", "sampling", "range_flow"), 3
+    ),
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),

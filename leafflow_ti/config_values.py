@@ -1,0 +1,74 @@
+"""Single values of a configuration from what people write: sizes, integers, lists of pixels; the machine's memory."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+_MEMORY_UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+_MIN_MEMORY = 64 * 2**20
+
+
+def parse_memory(value: object) -> int:
+    """Bytes of ``"8G"``, ``"512M"``, ``"1.5G"`` (binary multiples) or of a plain number; else ValueError."""
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", str(value), re.IGNORECASE)
+    if found is None:
+        raise ValueError("must be a size such as 8G, 512M or a number of bytes")
+    number = float(found[1]) if "." in found[1] else int(found[1])
+    size = int(number * _MEMORY_UNITS[found[2].upper()])
+    if size < _MIN_MEMORY:
+        raise ValueError("must be at least 64M")
+    return size
+
+
+def machine_memory() -> int:
+    """Memory [bytes] that this process may use: physical memory, or the limit of its control group where that is less.
+
+    8 GiB on systems that tell neither.
+    """
+    sizes = []
+    if hasattr(os, "sysconf"):  # not on Windows
+        sizes.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    limit = Path("/sys/fs/cgroup/memory.max")
+    if limit.is_file():
+        text = limit.read_text(encoding="ascii").strip()
+        sizes += [int(text)] if text.isdecimal() else []
+    return min(sizes, default=8 * 2**30)
+
+
+def integer(value: object, low: int, odd: bool = False) -> int:
+    """An integer of at least ``low``; else ValueError."""
+    try:
+        number = int(str(value))  # via str: True and 4.5 are no integers here
+    except ValueError:
+        number = low - 1
+    if number < low or (odd and number % 2 == 0):
+        raise ValueError(f"must be an {'odd ' if odd else ''}integer >= {low}")
+    return number
+
+
+def auto_or_integer(value: object, low: int, odd: bool = False) -> object:
+    """The same, or ``"auto"``."""
+    if value == "auto":
+        return value
+    try:
+        return integer(value, low, odd)
+    except ValueError as error:
+        raise ValueError(f'{error}, or "auto"') from None
+
+
+def numbers(value: object, counts: tuple[int, ...], form: str) -> tuple[int, ...]:
+    """Integers of ``"1,2"``, ``[1, 2]`` or ``1``; ValueError unless there are as many as one of ``counts``."""
+    if isinstance(value, str):
+        parts: Iterable[object] = value.split(",")
+    else:
+        parts = value if isinstance(value, list | tuple) else (value,)
+    try:
+        numbers = tuple(int(str(part)) for part in parts)
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in counts:
+        raise ValueError(f"must be whole pixels {form}")
+    return numbers
