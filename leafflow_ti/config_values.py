@@ -66,9 +66,9 @@ def numbers(value: object, counts: tuple[int, ...], form: str) -> tuple[int, ...
     else:
         parts = value if isinstance(value, list | tuple) else (value,)
     try:
-        numbers = tuple(int(str(part)) for part in parts)
+        found = tuple(int(str(part)) for part in parts)
     except ValueError:
-        numbers = ()
-    if len(numbers) not in counts:
+        found = ()
+    if len(found) not in counts:
         raise ValueError(f"must be whole pixels {form}")
-    return numbers
+    return found

@@ -292,13 +292,13 @@ def _fit_flops(problem: Problem, differences: bool) -> float:
         rows = 2 * terms
         flops += _cholesky(rows) + _substitute(rows, terms) + rows * terms * 2
         if "t" in columns.solutions:
-            flops += rows * motion_rows * (5 * len(cross_noise(sampling, columns, axis, "t")) + 2 * terms)
+            flops += rows * motion_rows * (2 * len(cross_noise(sampling, columns, axis, "t")) + 2 * terms)
     if terms:
         flops += _cholesky(terms) + _substitute(terms, 1 + motion_rows + terms)
     variants = 3 if differences else 1
     for i in range(problem.passes if problem.fitted else 0):
         last = i == problem.passes - 1 and not own
-        flops += _row_set_flops(motion_rows + problem.use_range, terms, problem.fitted, variants if last else 1, True)
+        flops += _row_set_flops(motion_rows + problem.use_range, terms, problem.fitted, variants if last else 0, True)
     if own:
         unknowns = own.unknowns + own.growth
         sets = [2 * len(own.offsets)] * len(own.steps)
@@ -308,13 +308,16 @@ def _fit_flops(problem: Problem, differences: bool) -> float:
 
 
 def _row_set_flops(rows: int, terms: int, unknowns: int, variants: int, finish: bool) -> float:
-    """Design and its sensitivity to the geometry, weights, normal equations and covariances of one set of rows."""
-    flops = rows * (ROW_FLOPS + 2 * unknowns) * (1.0 + 2 * min(terms, 3))
+    """Design and its sensitivity to the geometry, weights, normal equations and covariances of one set of rows.
+
+    ``variants``: covariances, 0 where only the motion is wanted. Of symmetric matrices one triangle counts.
+    """
+    flops = rows * (ROW_FLOPS + 2 * unknowns) * (1.0 + min(terms, 3))  # forward differences
     flops += rows * terms * 2 * (terms + (rows + 1) / 2)  # D C_g D^T
     flops += _cholesky(rows) + _substitute(rows, unknowns)
-    flops += 2 * rows * unknowns * (unknowns + 1)
-    flops += variants * 2 * rows * unknowns * (rows + unknowns + 2 * terms)
+    flops += rows * unknowns * (unknowns + 1) + 2 * rows * unknowns
+    flops += variants * 2 * rows * unknowns * (rows + (unknowns + 1) / 2 + 2 * terms)
     if finish:
         flops += _cholesky(unknowns) + _substitute(unknowns, 1)
-        flops += variants * (2 * _substitute(unknowns, unknowns) + 2 * unknowns * terms * (terms + 2 * unknowns))
+        flops += variants * (2 * _substitute(unknowns, unknowns) + 2 * unknowns * terms * (terms + unknowns + 1))
     return flops

@@ -1,7 +1,8 @@
 """What a kernel is compiled for: structure only, never a value.
 
-A *group* is ``lanes`` neighbouring pixels that are worked on together. On the CPU the lanes are the innermost,
-vectorised loop, and a few tasks share the groups; on a GPU a group is one pixel and every group a thread.
+A *group* is ``lanes`` neighbouring pixels that are worked on together. On the CPU the lanes are one vector (or, in the
+kernels of ``planes``, the innermost loop), and a few tasks share the groups; on a GPU a group is one pixel and every
+group a thread.
 """
 
 from dataclasses import dataclass
