@@ -123,7 +123,7 @@ class Stages:
     def of(cls, plan: Plan, capture: Capture, device: Device) -> Stages:
         """Builds the stages; compiles nothing."""
         problem = plan.problem
-        band = Band.of(problem.sampling, len(plan.y), len(plan.x), plan.config.window.stride)
+        band = Band.of(problem.sampling, len(plan.y), len(plan.x), plan.x.step)
         tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band)
         view = _view(plan, band, tensor.out_pitch)
         estimate = EstimateStage(device, problem, plan.layout, view, bool(plan.margin))
