@@ -44,6 +44,7 @@ def filter_taps() -> Array:
     gaussian = np.exp(-0.5 * (offset / PREFILTER_SIGMA) ** 2)
     inverse = math.sqrt(3) * (math.sqrt(3) - 2) ** np.abs(offset)
     taps = np.convolve(gaussian, inverse, "same")
+    taps = (taps + taps[::-1]) / 2  # symmetric to the last bit
     radius = int(np.abs(offset[np.abs(taps) >= LEAST_TAP * taps.max()]).max())
     taps = taps[64 - radius : 64 + radius + 1]
     taps = np.asarray(taps / taps.sum())
