@@ -25,6 +25,7 @@ class Stage(IntEnum):
     PREPARE = auto()  # vector of images
     HAND_OVER = auto()  # image
     WARP = auto()  # vector of samples
+    TEXTURE = auto()  # vector of samples
     GRAM = auto()  # function
     SUMS = auto()  # image
     SOLVE = auto()  # pixel
@@ -63,8 +64,11 @@ def refine_kernel(spec: KernelSpec, stage: Stage | None = None):
                 warps.prepare(slot, i, size, value, image, P, p)
             for i in range(size[Size.IMAGES]):
                 warps.hand_over(slot, i, size, p, r)
+            if p[scalars(slot, size) + Scalar.RESAMPLE] > 0.5:
+                for i in range(size[Size.SAMPLE_GROUPS]):
+                    samples.warp(slot, i, at, size, value, origin, sample, coef, S, r)
             for i in range(size[Size.SAMPLE_GROUPS]):
-                samples.warp(slot, i, at, size, value, origin, sample, coef, S, r, p)
+                samples.texture(slot, i, size, value, sample, S, r, p)
             for i in range(FUNCTIONS):
                 samples.gram(slot, i, size, S, p)
             for i in range(size[Size.IMAGES]):
@@ -103,7 +107,10 @@ def refine_kernel(spec: KernelSpec, stage: Stage | None = None):
             elif ti.static(stage == Stage.HAND_OVER):
                 warps.hand_over(slot, i, size, p, r)
             elif ti.static(stage == Stage.WARP):
-                samples.warp(slot, i, centre[pixel], size, value, origin, sample, coef, S, r, p)
+                if p[scalars(slot, size) + Scalar.RESAMPLE] > 0.5:
+                    samples.warp(slot, i, centre[pixel], size, value, origin, sample, coef, S, r)
+            elif ti.static(stage == Stage.TEXTURE):
+                samples.texture(slot, i, size, value, sample, S, r, p)
             elif ti.static(stage == Stage.GRAM):
                 samples.gram(slot, i, size, S, p)
             elif ti.static(stage == Stage.SUMS):

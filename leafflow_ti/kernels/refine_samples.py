@@ -2,7 +2,7 @@
 
     V_k(δ) = g_k(δ) (T(δ) + blur_k · (Txx, Txy, Tyy))        g_k = 1 + Σ a_k,m φ_m(δ)
 
-Images are interpolated by cubic B-splines. What smooths an image (the area of a pixel, the prefilter) is isotropic there,
+Images are interpolated by quintic B-splines. What smooths an image (the area of a pixel, the prefilter) is isotropic there,
 so images in which the surface looks narrower show it smoother along that direction: to first order by the second
 derivatives of the texture, with weights that follow from the warps (``Warp.BLUR``).
 """
@@ -11,7 +11,7 @@ import functools
 from types import SimpleNamespace
 
 from leafflow_ti.kernels.engine import lane_type, ti
-from leafflow_ti.kernels.refine_tables import FUNCTIONS, NOTHING, SHIFTS, TERMS, Scalar, Size, Value, Warp
+from leafflow_ti.kernels.refine_tables import DERIVATIVES, FUNCTIONS, NOTHING, SHIFTS, Scalar, Size, Value, Warp
 from leafflow_ti.kernels.refine_warp import warp_functions
 from leafflow_ti.kernels.spec import KernelSpec
 
@@ -71,16 +71,94 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
         S[slot.real + size[Size.WEIGHT] + group] = w
 
     @ti.func
+    def position(at: ti.i32, x: ti.template(), y: ti.template(), along: ti.i32, r: ti.template()):
+        """Where the homography at ``at`` puts the window points (x, y), from the block's centre, along x (0) or y (1)."""
+        depth = 1.0 / (r[at + 6] * x + r[at + 7] * y + 1.0)
+        return (r[at + 3 * along] * x + r[at + 3 * along + 1] * y + r[at + 3 * along + 2]) * depth
+
+    @ti.func
+    def spline(m: ti.i32, derivative: ti.i32, u: ti.template(), value: ti.template()):
+        """Weight of neighbour m of six for a point ``u`` behind the third one, or a derivative of the weight."""
+        at = Value.SPLINE + (6 * derivative + m) * 6
+        w = ti.cast(value[at + 5], real) * u + ti.cast(value[at + 4], real)
+        for k in ti.static(range(3, -1, -1)):
+            w = w * u + ti.cast(value[at + k], real)
+        return w
+
+    @ti.func
     def warp(
         slot: ti.template(), group: ti.i32, centre: ti.i32, size: ti.template(), value: ti.template(),
         origin: ti.template(), sample: ti.template(), coef: ti.template(), S: ti.template(), r: ti.template(),
-        p: ti.template(),
     ):  # fmt: skip
-        """One vector of samples in every image: values, texture, its derivatives, and the functions of the window."""
-        groups, terms, pitch = size[Size.SAMPLE_GROUPS], size[Size.TERMS], size[Size.PITCH]
+        """Value and derivatives, to the second, of every image at one vector of samples: quintic B-splines."""
+        groups, pitch = size[Size.SAMPLE_GROUPS], size[Size.PITCH]
+        farthest = ti.cast(value[Value.LIMIT], real)
+        x, y = sample[group], sample[groups + group]
+        for k in range(size[Size.IMAGES]):
+            at = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
+            ix, iy = position(at, x, y, 0, r), position(at, x, y, 1, r)
+            inside = ti.select(ti.max(ti.max(ix, 0.0 - ix), ti.max(iy, 0.0 - iy)) < V(farthest), V(1.0), V(0.0))
+            ix = ti.max(ti.min(ix, V(farthest)), V(0.0 - farthest))
+            iy = ti.max(ti.min(iy, V(farthest)), V(0.0 - farthest))
+            fx, fy = ti.floor(ix), ti.floor(iy)
+            u, v = ix - fx, iy - fy
+            corner = (fy - 2.0) * ti.cast(pitch, real) + (fx - 2.0)
+            a0, a1, a2 = spline(0, 0, u, value), spline(1, 0, u, value), spline(2, 0, u, value)
+            a3, a4, a5 = spline(3, 0, u, value), spline(4, 0, u, value), spline(5, 0, u, value)
+            d0, d1, d2 = spline(0, 1, u, value), spline(1, 1, u, value), spline(2, 1, u, value)
+            d3, d4, d5 = spline(3, 1, u, value), spline(4, 1, u, value), spline(5, 1, u, value)
+            e0, e1, e2 = spline(0, 2, u, value), spline(1, 2, u, value), spline(2, 2, u, value)
+            e3, e4, e5 = spline(3, 2, u, value), spline(4, 2, u, value), spline(5, 2, u, value)
+            val, gx, gy, gxx, gxy, gyy = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+            worst = V(0.0)
+            for row in range(6):
+                first = origin[k] + centre + row * pitch
+                c0, c1, c2, c3, c4, c5 = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+                if ti.static(lanes == 1):
+                    b = first + ti.cast(corner, ti.i32)
+                    c0, c1, c2, c3, c4, c5 = coef[b], coef[b + 1], coef[b + 2], coef[b + 3], coef[b + 4], coef[b + 5]
+                else:
+                    for i in ti.static(range(lanes)):
+                        b = first + ti.cast(corner[i], ti.i32)
+                        c0[i] = coef[b]
+                        c1[i] = coef[b + 1]
+                        c2[i] = coef[b + 2]
+                        c3[i] = coef[b + 3]
+                        c4[i] = coef[b + 4]
+                        c5[i] = coef[b + 5]
+                worst = ti.max(worst, ti.max(ti.max(ti.max(c0, c1), ti.max(c2, c3)), ti.max(c4, c5)))
+                along = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3 + a4 * c4 + a5 * c5
+                slope = d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3 + d4 * c4 + d5 * c5
+                bend = e0 * c0 + e1 * c1 + e2 * c2 + e3 * c3 + e4 * c4 + e5 * c5
+                b0, b1 = spline(row, 0, v, value), spline(row, 1, v, value)
+                val = val + b0 * along
+                gx = gx + b0 * slope
+                gxx = gxx + b0 * bend
+                gy = gy + b1 * along
+                gxy = gxy + b1 * slope
+                gyy = gyy + spline(row, 2, v, value) * along
+            seen = (worst < V(0.1 * NOTHING)) & (inside > V(0.5))
+            to = slot.real + size[Size.SEEN] + DERIVATIVES * k * groups + group
+            S[to] = ti.select(seen, val, V(NOTHING))
+            S[to + groups] = ti.select(seen, gx, V(0.0))
+            S[to + 2 * groups] = ti.select(seen, gy, V(0.0))
+            S[to + 3 * groups] = ti.select(seen, gxx, V(0.0))
+            S[to + 4 * groups] = ti.select(seen, gxy, V(0.0))
+            S[to + 5 * groups] = ti.select(seen, gyy, V(0.0))
+
+    @ti.func
+    def texture(
+        slot: ti.template(), group: ti.i32, size: ti.template(), value: ti.template(), sample: ti.template(),
+        S: ti.template(), r: ti.template(), p: ti.template(),
+    ):  # fmt: skip
+        """One vector of samples: values of all images where the warps are now, and the texture.
+
+        Since the images were sampled the warps have moved little: the second-order expansion there is exact enough.
+        Where they have just been sampled, the texture's derivatives and the functions of the window are made, too.
+        """
+        groups, terms = size[Size.SAMPLE_GROUPS], size[Size.TERMS]
         s = scalars(slot, size)
         limit = ti.cast(p[s + Scalar.ROBUST], real)
-        farthest = ti.cast(value[Value.LIMIT], real)
         half = 1.0 / ti.cast(value[Value.HALF], real)
         x, y = sample[group], sample[groups + group]
         ux, uy = x * half, y * half
@@ -90,109 +168,64 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
         mass, level = V(0.0), V(0.0)
         mean_xx, mean_xy, mean_yy = V(0.0), V(0.0), V(0.0)
         tx, ty, txx, txy, tyy = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+        fresh = p[s + Scalar.RESAMPLE] > 0.5
         for k in range(size[Size.IMAGES]):
             at = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
-            depth = 1.0 / (r[at + 6] * x + r[at + 7] * y + 1.0)
-            ix = (r[at] * x + r[at + 1] * y + r[at + 2]) * depth
-            iy = (r[at + 3] * x + r[at + 4] * y + r[at + 5]) * depth
-            inside = ti.select(ti.max(ti.max(ix, 0.0 - ix), ti.max(iy, 0.0 - iy)) < V(farthest), V(1.0), V(0.0))
-            ix = ti.max(ti.min(ix, V(farthest)), V(0.0 - farthest))
-            iy = ti.max(ti.min(iy, V(farthest)), V(0.0 - farthest))
-            fx, fy = ti.floor(ix), ti.floor(iy)
-            u, v = ix - fx, iy - fy
-            corner = (fy - 1.0) * ti.cast(pitch, real) + (fx - 1.0)
-            first = origin[k] + centre
-            # Cubic B-spline and its derivatives at the four neighbours along each axis.
-            u2, v2 = u * u, v * v
-            u3, v3 = u2 * u, v2 * v
-            sixth = ti.cast(1.0 / 6.0, real)
-            a0, a3 = (1.0 - 3.0 * u + 3.0 * u2 - u3) * sixth, u3 * sixth
-            a1, a2 = (4.0 - 6.0 * u2 + 3.0 * u3) * sixth, (1.0 + 3.0 * u + 3.0 * u2 - 3.0 * u3) * sixth
-            da0, da3 = 0.0 - 0.5 + u - 0.5 * u2, 0.5 * u2
-            da1, da2 = 1.5 * u2 - 2.0 * u, 0.5 + u - 1.5 * u2
-            dda1, dda2 = 3.0 * u - 2.0, 1.0 - 3.0 * u
-            val, gx, gy, gxx, gxy, gyy = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
-            worst = V(0.0)
-            for row in ti.static(range(4)):
-                c0, c1, c2, c3 = V(0.0), V(0.0), V(0.0), V(0.0)
-                if ti.static(lanes == 1):
-                    b = first + row * pitch + ti.cast(corner, ti.i32)
-                    c0, c1, c2, c3 = coef[b], coef[b + 1], coef[b + 2], coef[b + 3]
-                else:
-                    for i in ti.static(range(lanes)):
-                        b = first + row * pitch + ti.cast(corner[i], ti.i32)
-                        c0[i] = coef[b]
-                        c1[i] = coef[b + 1]
-                        c2[i] = coef[b + 2]
-                        c3[i] = coef[b + 3]
-                worst = ti.max(worst, ti.max(ti.max(c0, c1), ti.max(c2, c3)))
-                along = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3
-                slope = da0 * c0 + da1 * c1 + da2 * c2 + da3 * c3
-                bend = (1.0 - u) * c0 + dda1 * c1 + dda2 * c2 + u * c3
-                b, db, ddb = a0, a0, a0
-                if ti.static(row == 0):
-                    b, db = (1.0 - 3.0 * v + 3.0 * v2 - v3) * sixth, 0.0 - 0.5 + v - 0.5 * v2
-                    ddb = 1.0 - v
-                elif ti.static(row == 1):
-                    b, db, ddb = (4.0 - 6.0 * v2 + 3.0 * v3) * sixth, 1.5 * v2 - 2.0 * v, 3.0 * v - 2.0
-                elif ti.static(row == 2):
-                    b, db = (1.0 + 3.0 * v + 3.0 * v2 - 3.0 * v3) * sixth, 0.5 + v - 1.5 * v2
-                    ddb = 1.0 - 3.0 * v
-                else:
-                    b, db, ddb = v3 * sixth, 0.5 * v2, v
-                val = val + b * along
-                gx = gx + b * slope
-                gxx = gxx + b * bend
-                gy = gy + db * along
-                gxy = gxy + db * slope
-                gyy = gyy + ddb * along
-            val = ti.select((worst < V(0.1 * NOTHING)) & (inside > V(0.5)), val, V(NOTHING))
+            n = slot.real + size[Size.SEEN] + DERIVATIVES * k * groups + group
+            gx, gy, gxx, gxy, gyy = (
+                S[n + groups], S[n + 2 * groups], S[n + 3 * groups], S[n + 4 * groups], S[n + 5 * groups]
+            )  # fmt: skip
+            val = S[n]
+            if not fresh:
+                dx = position(at, x, y, 0, r) - position(at + Warp.SAMPLED, x, y, 0, r)
+                dy = position(at, x, y, 1, r) - position(at + Warp.SAMPLED, x, y, 1, r)
+                val = val + dx * (gx + 0.5 * (dx * gxx) + dy * gxy) + dy * (gy + 0.5 * (dy * gyy))
             S[slot.real + size[Size.VALUES] + k * groups + group] = val
             g = gain(at, terms, ux, uy, r)
             blur = r[at + Warp.BLUR] * bxx + r[at + Warp.BLUR + 1] * bxy + r[at + Warp.BLUR + 2] * byy
-            weight = weight_of(val, g * (before + blur), limit) * r[at + Warp.TRUST]
-            seen = ti.select(val < V(0.1 * NOTHING), val, V(0.0))
-            level = level + weight * g * seen
-            both = weight * g * g
+            weight = weight_of(val, g * (before + blur), limit) * r[at + Warp.TRUST] * g
+            level = level + weight * ti.select(val < V(0.1 * NOTHING), val, V(0.0))
+            both = weight * g
             mass = mass + both
             mean_xx = mean_xx + both * r[at + Warp.BLUR]
             mean_xy = mean_xy + both * r[at + Warp.BLUR + 1]
             mean_yy = mean_yy + both * r[at + Warp.BLUR + 2]
-            # Derivatives by δ, through ∂x/∂δ at the window's centre; weighted as values are.
-            xx, xy, yx, yy = r[at + Warp.D], r[at + Warp.D + 1], r[at + Warp.D + 2], r[at + Warp.D + 3]
-            weight = ti.select(val < V(0.1 * NOTHING), weight * g, V(0.0))
-            tx = tx + weight * (xx * gx + yx * gy)
-            ty = ty + weight * (xy * gx + yy * gy)
-            txx = txx + weight * (xx * xx * gxx + 2.0 * xx * yx * gxy + yx * yx * gyy)
-            txy = txy + weight * (xx * xy * gxx + (xx * yy + xy * yx) * gxy + yx * yy * gyy)
-            tyy = tyy + weight * (xy * xy * gxx + 2.0 * xy * yy * gxy + yy * yy * gyy)
+            if fresh:
+                # Derivatives by δ, through ∂x/∂δ at the window's centre; weighted as values are.
+                xx, xy, yx, yy = r[at + Warp.D], r[at + Warp.D + 1], r[at + Warp.D + 2], r[at + Warp.D + 3]
+                tx = tx + weight * (xx * gx + yx * gy)
+                ty = ty + weight * (xy * gx + yy * gy)
+                txx = txx + weight * (xx * xx * gxx + 2.0 * xx * yx * gxy + yx * yx * gyy)
+                txy = txy + weight * (xx * xy * gxx + (xx * yy + xy * yx) * gxy + yx * yy * gyy)
+                tyy = tyy + weight * (xy * xy * gxx + 2.0 * xy * yy * gxy + yy * yy * gyy)
         some = ti.select(mass > V(1e-6), V(1.0), V(0.0))
         scale = some / ti.max(mass, V(1e-6))
-        tx, ty, txx, txy, tyy = tx * scale, ty * scale, txx * scale, txy * scale, tyy * scale
-        texture = (level - mean_xx * txx - mean_xy * txy - mean_yy * tyy) * scale
-        S[slot.real + size[Size.BEFORE] + group] = before
-        S[slot.real + size[Size.TEXTURE] + group] = texture
+        old = slot.real + size[Size.SCRATCH] + group
+        S[old], S[old + groups], S[old + 2 * groups] = bxx, bxy, byy
         to = slot.real + size[Size.FUNCTION] + group
-        e = x * tx + y * ty
-        S[to] = tx
-        S[to + groups] = ty
-        S[to + 2 * groups] = x * tx
-        S[to + 3 * groups] = y * tx
-        S[to + 4 * groups] = x * ty
-        S[to + 5 * groups] = y * ty
-        S[to + 6 * groups] = x * e
-        S[to + 7 * groups] = y * e
+        if fresh:
+            tx, ty = tx * scale, ty * scale
+            bxx, bxy, byy = txx * scale, txy * scale, tyy * scale
+            S[blurred], S[blurred + groups], S[blurred + 2 * groups] = bxx, bxy, byy
+            e = x * tx + y * ty
+            S[to] = tx
+            S[to + groups] = ty
+            S[to + 2 * groups] = x * tx
+            S[to + 3 * groups] = y * tx
+            S[to + 4 * groups] = x * ty
+            S[to + 5 * groups] = y * ty
+            S[to + 6 * groups] = x * e
+            S[to + 7 * groups] = y * e
+        found = (level - mean_xx * bxx - mean_xy * bxy - mean_yy * byy) * scale
+        S[slot.real + size[Size.BEFORE] + group] = before
+        S[slot.real + size[Size.TEXTURE] + group] = found
         to = to + SHIFTS * groups
-        S[to] = texture
-        S[to + groups] = texture * ux
-        S[to + 2 * groups] = texture * uy
-        S[to + 3 * groups] = texture * ux * ux
-        S[to + 4 * groups] = texture * ux * uy
-        S[to + 5 * groups] = texture * uy * uy
-        S[slot.real + size[Size.SCRATCH] + group] = bxx
-        S[slot.real + size[Size.SCRATCH] + groups + group] = bxy
-        S[slot.real + size[Size.SCRATCH] + 2 * groups + group] = byy
-        S[blurred], S[blurred + groups], S[blurred + 2 * groups] = txx, txy, tyy
+        S[to] = found
+        S[to + groups] = found * ux
+        S[to + 2 * groups] = found * uy
+        S[to + 3 * groups] = found * ux * ux
+        S[to + 4 * groups] = found * ux * uy
+        S[to + 5 * groups] = found * uy * uy
 
     @ti.func
     def sums(
@@ -309,4 +342,6 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
                 found += ti.cast(r[first + i * n + k] * r[first + (SHIFTS + j) * n + k], precise)
             p[s + Scalar.NOISE + i * SHIFTS + j] = found
 
-    return SimpleNamespace(window=window, warp=warp, sums=sums, gram=gram, spread_noise=spread_noise, noise=noise)
+    return SimpleNamespace(
+        window=window, warp=warp, texture=texture, sums=sums, gram=gram, spread_noise=spread_noise, noise=noise
+    )  # fmt: skip

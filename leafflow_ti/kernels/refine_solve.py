@@ -29,6 +29,8 @@ from leafflow_ti.kernels.spec import KernelSpec
 
 LONGEST_STEP = 1.0
 """Pixels that a step may move anything in the window of any image."""
+DRIFT = 0.15
+"""Pixels that the warps may move before the images are sampled anew."""
 OUTLYING = 16.0
 """Mean squared residual of an image, against the typical one, beyond which it is trusted less."""
 TUKEY = 6.0
@@ -116,6 +118,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.ACCEPTED + i] = start[at + 2 + i]
         for i in range(Scalar.COST, Scalar.ROBUST + 1):
             p[s + i] = precise(0.0)
+        p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
         for g in range(groups):
             P[slot.precise + size[Size.TRUST] + g] = image[Image.PRESENT * groups + g]
             for m in range(TERMS):
@@ -340,6 +343,8 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             square -= p[s + Scalar.STEP + i] * p[s + Scalar.RIGHT + i]
         far = farthest(slot, size, value, P, p)
         factor = ti.min(precise(1.0), LONGEST_STEP / ti.max(far, precise(1e-30)))
+        # Moves are about their mean, so the images move by up to twice as much.
+        p[s + Scalar.DRIFT] += 2.0 * far * factor
         for i in range(n):
             p[s + Scalar.STEP + i] *= factor
             u = size[Size.LIST + i]
@@ -386,6 +391,9 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
                 if p[s + Scalar.LAST] > ti.max(LAST_STEP * error, CONTRACTED * p[s + Scalar.FIRST]):
                     p[s + Scalar.CODE] = not_converged
         p[s + Scalar.ROBUST] = TUKEY * TUKEY * cost
+        p[s + Scalar.RESAMPLE] = precise(0.0)
+        if p[s + Scalar.DRIFT] > DRIFT:
+            p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
 
     @ti.func
     def finish(

@@ -12,6 +12,8 @@ SHIFTS = 8
 TERMS = 6
 """Most photometric terms of an image."""
 FUNCTIONS = SHIFTS + TERMS
+DERIVATIVES = 6
+"""Of a sample: value, x, y, xx, xy, yy."""
 MAX_UNKNOWNS = 15
 """Z0, ZX, ZY, N, Ω, A, and up to three growth rates."""
 GROWTH = 12
@@ -36,7 +38,8 @@ class Size(IntEnum):
     SLOT_REAL = auto()  # sample vectors of a pixel's workspace
     SLOT_PRECISE = auto()  # image vectors of it
     # Regions of the first, in sample vectors.
-    VALUES = auto()  # [images, sample groups]: warped images; NOTHING where there is none
+    SEEN = auto()  # [images, DERIVATIVES, sample groups]: warped images; NOTHING where there is none
+    VALUES = auto()  # [images, sample groups]: the same where the warps are now
     TEXTURE = auto()
     BEFORE = auto()  # texture of the pass before
     FUNCTION = auto()  # [FUNCTIONS, sample groups]
@@ -69,7 +72,8 @@ class Warp(IntEnum):
     BLUR = 12  # [3]: weights of the texture's second derivatives xx, xy, yy
     GAIN = 15  # [TERMS]
     TRUST = 21
-    N = 24
+    SAMPLED = 22  # [8]: homography with which the image was sampled
+    N = 32
 
 
 class Geometry(IntEnum):
@@ -105,7 +109,8 @@ class Value(IntEnum):
     HALF = auto()  # half the window, px
     LIMIT = auto()  # farthest that a sample may lie from the centre of its block, px
     CORRELATION = auto()  # sum of the noise correlation over the lattice times Σw² / Σw
-    CORRELATION_AT = 8  # noise correlation along one axis at 0, 1, ... steps of the lattice
+    SPLINE = auto()  # [3, 6, 6]: quintic B-spline and two derivatives: neighbour, power
+    CORRELATION_AT = SPLINE + 108  # noise correlation along one axis at 0, 1, ... steps of the lattice
 
 
 class Scalar(IntEnum):
@@ -145,6 +150,8 @@ class Scalar(IntEnum):
     LIFT = 1322  # [3, 2]: L
     MODES = 1328  # [3, 3, 2]: E_j L of the growth rates
     EFFECTIVE = 1346  # samples of equal weight that the window stands for
+    RESAMPLE = 1347  # whether the images are sampled in this pass
+    DRIFT = 1348  # px that the warps have moved since
     N = 1360
 
 

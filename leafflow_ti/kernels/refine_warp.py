@@ -286,15 +286,16 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
         P[b + 2 * groups] = (xx * xx + yx * yx) * weight - value[Value.SMOOTHING]
 
     @ti.func
-    def hand_over(
-        slot: ti.template(), k: ti.i32, size: ti.template(), p: ti.template(), r: ti.template()
-    ):
+    def hand_over(slot: ti.template(), k: ti.i32, size: ti.template(), p: ti.template(), r: ti.template()):
         """The numbers of image k, as the samples need them."""
         groups = size[Size.IMAGE_GROUPS]
         to = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
         at = (slot.precise + size[Size.HOMOGRAPHY]) * lanes + k
         for n in range(Warp.GAIN):
             r[to + n] = ti.cast(p[at + n * groups * lanes], real)
+        if p[scalars(slot, size) + Scalar.RESAMPLE] > 0.5:
+            for n in range(8):
+                r[to + Warp.SAMPLED + n] = r[to + n]
         at = (slot.precise + size[Size.GAIN]) * lanes + k
         for n in range(TERMS):
             r[to + Warp.GAIN + n] = ti.cast(p[at + n * groups * lanes], real)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.refine_plan import FILTER_RADIUS, PIXEL_VARIANCE, PREFILTER_SIGMA, Refinement, filter_taps
+from leafflow_ti.refine_plan import PIXEL_VARIANCE, Refinement
 from leafflow_ti.runtime import Device
+from leafflow_ti.splines import FILTER_RADIUS, PREFILTER_SIGMA, SUPPORT, filter_taps, spline, spline_pieces
 from leafflow_ti.stages.estimate_tables import View
 from leafflow_ti.stages.planes import Filtering, round_up
 from leafflow_ti.trace import span
@@ -188,7 +189,8 @@ class RefineStage:
         size = self.size
         parts = {
             Stage.WINDOW: size[Size.SAMPLE_GROUPS], Stage.PREPARE: size[Size.IMAGE_GROUPS],
-            Stage.HAND_OVER: size[Size.IMAGES], Stage.WARP: size[Size.SAMPLE_GROUPS], Stage.GRAM: FUNCTIONS,
+            Stage.HAND_OVER: size[Size.IMAGES], Stage.WARP: size[Size.SAMPLE_GROUPS],
+            Stage.TEXTURE: size[Size.SAMPLE_GROUPS], Stage.GRAM: FUNCTIONS,
             Stage.SUMS: size[Size.IMAGES], Stage.SPREAD: SHIFTS, Stage.NOISE: SHIFTS,
         }  # fmt: skip
 
@@ -216,7 +218,7 @@ class _Tables:
     @classmethod
     def of(cls, plan: Refinement, view: View, lanes: int, pitch: int) -> _Tables:
         from leafflow_ti.kernels.refine_tables import (
-            FUNCTIONS, SHIFTS, TERMS, Geometry, Image, Scalar, Size, Value, Warp,
+            DERIVATIVES, FUNCTIONS, SHIFTS, TERMS, Geometry, Image, Scalar, Size, Value, Warp,
         )  # fmt: skip
 
         unknowns = _unknowns(plan)
@@ -236,7 +238,7 @@ class _Tables:
             size[name] = entry
         warps = -(-k * Warp.N // lanes)
         slot_real = _lay_out(size, {
-            Size.VALUES: k * groups, Size.TEXTURE: groups, Size.BEFORE: groups, Size.FUNCTION: FUNCTIONS * groups,
+            Size.SEEN: DERIVATIVES * k * groups, Size.VALUES: k * groups, Size.TEXTURE: groups, Size.BEFORE: groups, Size.FUNCTION: FUNCTIONS * groups,
             Size.BLUR: 3 * groups, Size.WEIGHT: groups, Size.SCRATCH: 2 * SHIFTS * groups, Size.WARP: warps,
         })  # fmt: skip
         slot_precise = _lay_out(size, {
@@ -266,6 +268,7 @@ class _Tables:
         value[Value.LIMIT] = plan.size // 2 + plan.reach
         both = 2 * correlation.sum() - 1
         value[Value.CORRELATION] = both**2 * np.sum(sample[2] ** 2) / np.sum(sample[2])
+        value[Value.SPLINE : Value.CORRELATION_AT] = spline_pieces().ravel()
         value[Value.CORRELATION_AT :] = correlation
         return cls(size, value, image, sample, slot_real, slot_precise)
 
@@ -294,18 +297,12 @@ def _noise_correlation(thin: int) -> Array:
     """
     fine = 32
     taps = filter_taps()
-    radius = FILTER_RADIUS + 2
+    radius = FILTER_RADIUS + SUPPORT
     u = np.arange(-radius * fine, radius * fine + 1) / fine
-    impulse = sum(tap * _cubic(u - r) for r, tap in enumerate(taps, -FILTER_RADIUS))
+    impulse = np.sum([tap * spline(u - r) for r, tap in enumerate(taps, -FILTER_RADIUS)], axis=0)
     found = np.correlate(impulse, impulse, "full")
     found = found[len(u) - 1 :: thin * fine] / found[len(u) - 1]
     return np.asarray(found[: int(np.flatnonzero(np.abs(found) > 1e-3).max()) + 1])
-
-
-def _cubic(u: Array) -> Array:
-    """Cubic B-spline."""
-    a = np.abs(u)
-    return np.asarray(np.where(a < 1, 2 / 3 - a**2 + a**3 / 2, np.where(a < 2, (2 - a) ** 3 / 6, 0.0)))
 
 
 def _filters(device: Device, rows: int, pitch: int) -> tuple[Filtering, Filtering, Any, Any]:
