@@ -29,7 +29,7 @@ from leafflow_ti.kernels.spec import KernelSpec
 
 LONGEST_STEP = 1.0
 """Pixels that a step may move anything in the window of any image."""
-DRIFT = 0.15
+DRIFT = 0.05
 """Pixels that the warps may move before the images are sampled anew."""
 OUTLYING = 16.0
 """Mean squared residual of an image, against the typical one, beyond which it is trusted less."""
