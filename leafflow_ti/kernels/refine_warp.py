@@ -43,6 +43,11 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
         return (slot.precise + size[Size.SCALAR]) * lanes
 
     @ti.func
+    def geometry(slot: ti.template(), group: ti.i32, size: ti.template()) -> ti.i32:
+        """What the warps of a vector of images are made of: one place for all, unless they are made at once."""
+        return slot.precise + size[Size.GEOMETRY] + group * ti.static(Geometry.N if spec.gpu else 0)
+
+    @ti.func
     def aim(slot: ti.template(), size: ti.template(), value: ti.template(), p: ti.template()):
         """Ray, η and its derivatives, L, and E_j L of the growth rates, for the pixel's parameters."""
         s = scalars(slot, size)
@@ -150,7 +155,7 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
         P: ti.template(), p: ti.template(),
     ):  # fmt: skip
         """What each unknown does to the warps of one vector of images."""
-        s, g = scalars(slot, size), slot.precise + size[Size.GEOMETRY]
+        s, g = scalars(slot, size), geometry(slot, group, size)
         groups = size[Size.IMAGE_GROUPS]
         step = size[Size.UNKNOWNS] * groups
         near = 1.0 / p[s + Scalar.Q]
@@ -212,7 +217,7 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
         P: ti.template(), p: ti.template(),
     ):  # fmt: skip
         """Warps of one vector of images, and what every unknown does to them; ``aim`` has been called."""
-        s, g = scalars(slot, size), slot.precise + size[Size.GEOMETRY]
+        s, g = scalars(slot, size), geometry(slot, group, size)
         groups = size[Size.IMAGE_GROUPS]
         t = image[Image.TIME * groups + group]
         turn(g, t, s, P, p)
@@ -261,7 +266,7 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
         P: ti.template(), p: ti.template(),
     ):  # fmt: skip
         """The homography in pixels about the window's and the block's centre, ∂x/∂δ there, and the blur's weights."""
-        s, h = scalars(slot, size), slot.precise + size[Size.GEOMETRY] + Geometry.H
+        s, h = scalars(slot, size), geometry(slot, group, size) + Geometry.H
         groups = size[Size.IMAGE_GROUPS]
         to = slot.precise + size[Size.HOMOGRAPHY] + group
         depth = 1.0 / P[h + 8]

@@ -69,7 +69,7 @@ class RefineStage:
         self._filters = _filters(device, rows, self.pitch)
         self._mask: Any = None
         lanes = device.dense.lanes
-        tables = _Tables.of(plan, view, lanes, self.pitch)
+        tables = _Tables.of(plan, view, lanes, self.pitch, device.gpu)
         self.size, self._slot_real, self._slot_precise = tables.size, tables.slot_real, tables.slot_precise
         self._tables = (
             device.array(tables.size, "int"), device.array(tables.value, "algebra"),
@@ -216,7 +216,7 @@ class _Tables:
     slot_precise: int
 
     @classmethod
-    def of(cls, plan: Refinement, view: View, lanes: int, pitch: int) -> _Tables:
+    def of(cls, plan: Refinement, view: View, lanes: int, pitch: int, gpu: bool) -> _Tables:
         from leafflow_ti.kernels.refine_tables import (
             DERIVATIVES, FUNCTIONS, SHIFTS, TERMS, Geometry, Image, Scalar, Size, Value, Warp,
         )  # fmt: skip
@@ -245,7 +245,7 @@ class _Tables:
             Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
             Size.TRUST: images, Size.GAIN: TERMS * images, Size.GAIN_STEP: TERMS * images,
             Size.HOMOGRAPHY: Warp.GAIN * images, Size.PRODUCT: SHIFTS, Size.NORMAL: n * (n + 1) // 2, Size.RIGHT: n,
-            Size.SCALAR: -(-Scalar.N // lanes), Size.GEOMETRY: Geometry.N,
+            Size.SCALAR: -(-Scalar.N // lanes), Size.GEOMETRY: Geometry.N * (images if gpu else 1),
         })  # fmt: skip
         size[Size.SLOT_REAL], size[Size.SLOT_PRECISE] = slot_real, slot_precise
 
