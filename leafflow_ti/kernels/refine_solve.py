@@ -29,6 +29,8 @@ from leafflow_ti.kernels.spec import KernelSpec
 
 LONGEST_STEP = 1.0
 """Pixels that a step may move anything in the window of any image."""
+RISE = 1.02
+"""Factor by which a step may raise the cost: near the end the direction is that of noise, and of what is approximated."""
 DRIFT = 0.05
 """Pixels that the warps may move before the images are sampled anew."""
 OUTLYING = 16.0
@@ -376,7 +378,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.START] = cost
         if p[s + Scalar.IMAGES] < 2.0:
             p[s + Scalar.DONE], p[s + Scalar.CODE] = precise(1.0), empty
-        elif passes > 1 and not (cost <= p[s + Scalar.BEST] * 1.001):
+        elif passes > 1 and not (cost <= p[s + Scalar.BEST] * RISE):
             shorten(slot, size, P, p)
             if passes >= size[Size.STEPS]:
                 p[s + Scalar.DONE], p[s + Scalar.CODE] = precise(1.0), worse
