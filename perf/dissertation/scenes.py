@@ -80,12 +80,11 @@ def _truth(scene: Scene) -> Mapping[str, Array]:
     found = cube.truth(scene) if isinstance(scene, CubeScene) else plane.truth(scene) | brightness(scene)
     known = np.isfinite(found["depth"])
     found["omega"] = np.where(known[..., None], found["omega"], np.nan)
-    found["growth_rate"] = np.where(known, 0.0, np.nan)
     return found
 
 
 def truth(scene: Scene) -> Mapping[str, Array]:
-    """Maps [H, W, ...] of what the reference camera sees: those of ``metrics``, no growth, and the brightness of a
+    """Maps [H, W, ...] of what the reference camera sees: those of ``metrics``, and the brightness of a
     plane by the names of the results."""
     return _truth(replace(scene, noise=0.0))
 
