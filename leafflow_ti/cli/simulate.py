@@ -17,7 +17,7 @@ import typer
 from leafflow_ti.errors import UsageError
 
 if TYPE_CHECKING:
-    from leafflow_ti.synthetic.write import Scene
+    from leafflow_ti.synthetic.scene import Scene
 
 app = typer.Typer(
     name="simulate",

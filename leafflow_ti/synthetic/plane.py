@@ -63,7 +63,8 @@ class PlaneScene(RigidScene):
 
     ``alpha``, ``beta`` in rad (``beta`` None: equal to ``alpha``): of waves. ``offset`` and ``amplitude``: mean and
     amplitude of waves, or mean and standard deviation of noise, in grey values. ``wavelengths_mm``: of both waves, or
-    the shortest and the longest of the noise. ``supersampling``: rays per pixel and axis (None: 1 for waves, 4 for noise).
+    the shortest and the longest of the noise. ``supersampling``: rays per pixel and axis, None: 1 for waves, 4 for
+    noise.
     ``growth``: g [1/frame], of lengths, in all directions; see ``linear_growth``. ``strain`` [1/frame]: rates (11, 22,
     12) along ``tangent_axes`` beside it.
     Raises UsageError for values that make no sense.
