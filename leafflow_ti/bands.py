@@ -12,6 +12,8 @@ from leafflow_ti.errors import ConfigError
 from leafflow_ti.filters import gaussian_radius
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.range_plan import RangePlan
+from leafflow_ti.refine_plan import Refinement
+from leafflow_ti.stages.planes import round_up
 from leafflow_ti.stages.prefilter import prefilter_bytes
 from leafflow_ti.stages.problem import Problem
 from leafflow_ti.stages.tensor import Band, band_bytes
@@ -34,6 +36,7 @@ class Demand:
     problem: Problem
     layout: TensorLayout
     ranges: RangePlan | None
+    refine: Refinement | None
     n_cameras: int
     n_maps: int
     cols: int
@@ -42,8 +45,8 @@ class Demand:
         """Memory for units of ``rows`` rows while ``ahead`` frames are read ahead."""
         config, problem, ranges = self.config, self.problem, self.ranges
         itemsize = 4 if config.precision == "f32" else 8
-        # Two more rows and columns for the growth at the edges.
-        band = Band.of(problem.sampling, rows + 2, self.cols + 2, config.window.stride)
+        # Two more rows and columns for the growth at the edges, and for the start of a refinement there.
+        band = Band.of(problem.sampling, rows + 2, self.cols + 2, int(config.window.stride))
         own = problem.own_flows.requests if problem.own_flows else ()
         gpu = config.arch not in ("auto", "cpu")
         total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize, own, gpu)
@@ -52,12 +55,18 @@ class Demand:
             depth = ranges.depth
             read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
             total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize, gpu=gpu)
+        in_rows, in_cols = read.in_rows, read.in_cols
+        if self.refine:
+            wide = Band(band.rows, band.cols, band.stride, self.refine.halo, self.refine.halo)
+            in_rows, in_cols = max(in_rows, wide.in_rows), max(in_cols, wide.in_cols)
+            planes = len(self.refine.frames) * self.n_cameras
+            total += planes * wide.in_rows * round_up(wide.in_cols, 64) * itemsize
         margin = 0
         if config.filters.prefilter != "none":
             margin = gaussian_radius(config.filters.sigma_pre)
-            total += prefilter_bytes(config.filters.sigma_pre, self.n_cameras, read.in_rows, read.in_cols, itemsize)
+            total += prefilter_bytes(config.filters.sigma_pre, self.n_cameras, in_rows, in_cols, itemsize)
         # Grey values, and one byte that says whether each is finite.
-        block = self.n_cameras * (read.in_rows + 2 * margin) * (read.in_cols + 2 * margin) * (itemsize + 1)
+        block = self.n_cameras * (in_rows + 2 * margin) * (in_cols + 2 * margin) * (itemsize + 1)
         unit = rows * self.cols * (4 * self.n_maps + 1)
         # One frame and one unit are worked on, and one unit is being written.
         return total + (1 + ahead) * block + (2 + WRITE_BEHIND) * unit

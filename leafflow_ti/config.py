@@ -19,6 +19,14 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from leafflow_ti.config_values import auto_or_integer, integer, machine_memory, numbers, parse_memory
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
+from leafflow_ti.presets import (
+    PRESETS,
+    REFINED_MODEL,
+    REFINED_SAMPLES,
+    REFINED_STRIDE,
+    REFINED_WINDOW,
+    resolve_model,
+)
 
 Preset = Literal["fast", "balanced", "accurate"]
 ModelName = Literal[
@@ -27,7 +35,7 @@ ModelName = Literal[
 ]  # fmt: skip
 Motion = Literal["auto", "translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
-Deformation = Literal["auto", "none", "growth"]
+Deformation = Literal["auto", "none", "growth", "strain"]
 BrightnessTerms = Literal["none", "time", "space", "both"]
 Constraint = Literal["int", "grad", "intgrad", "taylor"]
 Estimator = Literal["ols", "tls", "tls-equilibrated"]
@@ -38,13 +46,6 @@ Weighting = Literal["wls", "ls"]
 Precision = Literal["f32", "f64"]
 Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 
-PRESETS: dict[str, dict[str, Any]] = {
-    "fast": {"stride": 4, "precision": "f32"},
-    "balanced": {"stride": 1, "precision": "f32"},
-    "accurate": {"stride": 1, "precision": "f64"},
-}
-"""What a preset decides where the configuration itself does not."""
-
 SIGMA_PER_SIZE = 19.0 / 65.0
 """Gaussian width relative to the window size in the dissertation's experiments (65 pixels, sigma 19)."""
 
@@ -53,6 +54,8 @@ _Taps = Annotated[Literal["3x1x1", "3", "5", "7"], BeforeValidator(str)]
 _AutoTaps = Annotated[Literal["auto", "3x1x1", "3", "5", "7"], BeforeValidator(str)]
 _AutoOdd = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 1, odd=True))]
 _AutoCount = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 1))]
+_AutoSteps = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 0, high=50))]
+_AutoRefined = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, REFINED_WINDOW, odd=True))]
 _Width = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -65,7 +68,8 @@ class ModelSection(_Section):
 
     ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its derivatives along x, y) followed by
     any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can. ``deformation`` growth:
-    the patch may grow in its plane, one more unknown; auto: where the flows of all cameras are there to tell.
+    the patch may grow in its plane, one more unknown; auto: where the flows of all cameras, or the refinement, are
+    there to tell. strain: in the refinement it may stretch in its plane, three more unknowns.
     """
 
     name: ModelName = "auto"
@@ -90,7 +94,8 @@ class ModelSection(_Section):
 
 
 class WindowSection(_Section):
-    """Gaussian windows. ``sigma`` left out or "auto": 19/65 of ``size``; sizes "auto": 5, or as many as there are.
+    """Gaussian windows. ``sigma`` left out or "auto": 19/65 of ``size``; sizes "auto": 5, or as many as there are;
+    ``stride`` "auto": as the preset has it.
 
     ``border``: "full" measures where the whole window lies inside all images, "clip" up to the image border with what
     is left of the window: values there are noisier, and less exact where the surface turns or bends.
@@ -102,7 +107,7 @@ class WindowSection(_Section):
     sigma_time: _Width = 1.0
     size_camera: _AutoOdd = "auto"
     sigma_camera: _Width = 1.0
-    stride: Annotated[int, BeforeValidator(lambda v: integer(v, 1))] = 1
+    stride: _AutoCount = "auto"
     border: Border = "full"
 
     @model_validator(mode="before")
@@ -136,6 +141,18 @@ class RangeFlowSection(_Section):
     constraint: Constraint = "taylor"
     beta: _Width = 1.0
     depth: str | None = None
+
+
+class RefineSection(_Section):
+    """Exact refinement: at most ``steps`` Gauss-Newton steps (0: none) on every ``thin``-th pixel of a ``window``.
+
+    "auto": ``steps`` as the preset has them for affine-scene-flow, else 0; ``window``: that of the model; ``thin``:
+    some 21 samples across the window, or more where the preset says so.
+    """
+
+    steps: _AutoSteps = "auto"
+    window: _AutoRefined = "auto"
+    thin: _AutoCount = "auto"
 
 
 class PlanSection(_Section):
@@ -201,7 +218,7 @@ class OutputSection(_Section):
 
 
 class RunConfig(_Section):
-    """A whole run. A preset decides ``window.stride`` and ``precision`` unless they are given themselves."""
+    """A whole run. A preset decides ``precision`` unless it is given itself, and what ``resolve`` does."""
 
     preset: Preset = "balanced"
     precision: Precision = "f32"
@@ -211,6 +228,7 @@ class RunConfig(_Section):
     window: WindowSection = WindowSection()
     filters: FiltersSection = FiltersSection()
     range_flow: RangeFlowSection = RangeFlowSection()
+    refine: RefineSection = RefineSection()
     plan: PlanSection = Field(default_factory=PlanSection)
     output: OutputSection = OutputSection()
 
@@ -220,12 +238,7 @@ class RunConfig(_Section):
         chosen = PRESETS.get(str(data.get("preset", "balanced"))) if isinstance(data, Mapping) else None
         if chosen is None:
             return data  # the field itself reports what is wrong
-        window = data.get("window", {})
-        if isinstance(window, WindowSection):
-            window = window.model_dump(exclude_unset=True)
-        if isinstance(window, Mapping):
-            window = {"stride": chosen["stride"], **window}
-        return {"precision": chosen["precision"], **data, "window": window}
+        return {"precision": chosen.precision, **data}
 
     @field_validator("preshift", mode="before")
     @classmethod
@@ -236,7 +249,7 @@ class RunConfig(_Section):
         return (x, *y) if y else (x, 0)
 
     def to_toml(self) -> str:
-        """The resolved configuration as ``run.toml``; ``load_config`` reads the same value back."""
+        """The configuration as ``run.toml``; ``load_config`` reads the same value back."""
         values = self.model_dump(mode="json", exclude_none=True)
         top = [f"{key} = {_toml(value)}" for key, value in values.items() if not isinstance(value, dict)]
         sections = [
@@ -259,6 +272,9 @@ KEYWORDS: dict[str, str] = {
     **{name: f"window.{name}" for name in WindowSection.model_fields if name != "size"},
     **{name: f"filters.{name}" for name in FiltersSection.model_fields},
     **{name: f"range_flow.{name}" for name in RangeFlowSection.model_fields},
+    "refine": "refine.steps",
+    "refine_window": "refine.window",
+    "thin": "refine.thin",
     **{name: f"plan.{name}" for name in PlanSection.model_fields},
     **{name: f"output.{name}" for name in OutputSection.model_fields},
 }
@@ -298,18 +314,28 @@ def load_config(
         raise ConfigError("; ".join(_explain(detail, given) for detail in error.errors())) from None
 
 
-def resolve_model(name: str, n_frames: int, n_rows: int, n_cols: int) -> str:
-    """The model that ``auto`` means for a capture; every other name is returned as it is.
+def resolve(config: RunConfig, n_frames: int, n_rows: int, n_cols: int) -> RunConfig:
+    """The configuration for a capture with the model, the stride and the refinement decided: none of them is "auto".
 
-    One camera: ``flow-affine``; a grid without time: ``depth``; with time ``affine-scene-flow``.
+    What was given itself wins over the preset. Resolving once more changes nothing.
     """
-    if name != "auto":
-        return name
-    if n_rows * n_cols == 1:
-        return "flow-affine"
-    if n_frames == 1:
-        return "depth"
-    return "affine-scene-flow"
+    name = resolve_model(config.model.name, n_frames, n_rows, n_cols)
+    preset, refine, window = PRESETS[config.preset], config.refine, config.window
+
+    def decided(given: int | str, auto: int) -> int:
+        return auto if given == "auto" else int(given)
+
+    steps = decided(refine.steps, preset.steps if name == REFINED_MODEL else 0)
+    size = decided(refine.window, max(window.size, REFINED_WINDOW))
+    thin = max(1, size // REFINED_SAMPLES)
+    thin = min(thin, preset.thin or thin)
+    sections = {
+        "model": {"name": name},
+        "window": {"stride": decided(window.stride, max(preset.stride, REFINED_STRIDE if steps else 1))},
+        "refine": {"steps": steps, "window": size, "thin": decided(refine.thin, thin)},
+    }
+    updated = {key: getattr(config, key).model_copy(update=values) for key, values in sections.items()}
+    return config.model_copy(update=updated)
 
 
 def _read_file(path: Path) -> dict[str, tuple[object, str]]:

@@ -38,23 +38,24 @@ def machine_memory() -> int:
     return min(sizes, default=8 * 2**30)
 
 
-def integer(value: object, low: int, odd: bool = False) -> int:
-    """An integer of at least ``low``; else ValueError."""
+def integer(value: object, low: int, odd: bool = False, high: int | None = None) -> int:
+    """An integer of at least ``low`` and, where that is given, at most ``high``; else ValueError."""
     try:
         number = int(str(value))  # via str: True and 4.5 are no integers here
     except ValueError:
         number = low - 1
-    if number < low or (odd and number % 2 == 0):
-        raise ValueError(f"must be an {'odd ' if odd else ''}integer >= {low}")
+    if number < low or (odd and number % 2 == 0) or (high is not None and number > high):
+        limits = f">= {low}" if high is None else f"from {low} to {high}"
+        raise ValueError(f"must be an {'odd ' if odd else ''}integer {limits}")
     return number
 
 
-def auto_or_integer(value: object, low: int, odd: bool = False) -> object:
+def auto_or_integer(value: object, low: int, odd: bool = False, high: int | None = None) -> object:
     """The same, or ``"auto"``."""
     if value == "auto":
         return value
     try:
-        return integer(value, low, odd)
+        return integer(value, low, odd, high)
     except ValueError as error:
         raise ValueError(f'{error}, or "auto"') from None
 

@@ -45,8 +45,16 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "brightness_world_y": ("1/(frame mm)", "relative brightness change per frame, slope along Y on the surface"),
     "brightness_world_tt": ("1/frame²", "change of the relative brightness change per frame of a surface point"),
     "growth_rate": ("%/frame", "relative growth rate of the surface area"),
+    "strain_rate_11": ("%/frame", "strain rate in the surface along its tangent in the plane of X and Z"),
+    "strain_rate_22": ("%/frame", "strain rate in the surface at right angles to that tangent"),
+    "strain_rate_12": ("%/frame", "shear strain rate in the surface, between the two"),
 }
 """Name of a map -> (unit, long name). Every map may have a companion ``NAME_std``, its standard error."""
+
+MOTION_NAMES = tuple(f"{q}_{a}" for q in ("velocity", "rotation", "acceleration") for a in "xyz")
+"""Maps of the unknowns (N, Ω, A)."""
+STRAIN_NAMES = ("strain_rate_11", "strain_rate_22", "strain_rate_12")
+"""Maps of the strain rates in the surface, which add up to the growth rate: 11 + 22."""
 
 
 def quantity(name: str) -> tuple[str, str]:

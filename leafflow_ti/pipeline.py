@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.capture import Capture
 from leafflow_ti.engines import Engine, keep
+from leafflow_ti.field import MOTION_NAMES
 from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
@@ -82,7 +83,7 @@ class Pipeline:
     def _one_pixel(self, trace: Trace | None) -> None:
         """Compute one pixel from random images until its windows are full, then one frame more for the trace."""
         plan = self.plan
-        band = Band.of(plan.problem.sampling, 1, 1, plan.config.window.stride)
+        band = Band.of(plan.problem.sampling, 1, 1, plan.x.step)
         engine = self._make_engine(band)
         shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
         if engine.ranges:
@@ -295,7 +296,6 @@ class Pipeline:
 
 def _plane_of(name: str) -> int:
     from leafflow_ti.kernels.maps import Output
-    from leafflow_ti.plan import MOTION_NAMES
 
     if name in MOTION_NAMES:
         return Output.MOTION + MOTION_NAMES.index(name)

@@ -6,20 +6,19 @@ for range flow the noise of one image.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from leafflow_ti.bands import READ_AHEAD, Demand, choose_bands, usable_memory
 from leafflow_ti.capture import DEFAULT_CACHE_BYTES, ArrayCapture, Capture, Geometry, find_preshift
-from leafflow_ti.config import RunConfig, resolve_model
-from leafflow_ti.errors import ConfigError, InputError
-from leafflow_ti.filters import choose_filter_set, filter_set
-from leafflow_ti.models import MODELS, OWN_FLOW, Model, TensorLayout, column_set, parse_rows
+from leafflow_ti.config import RunConfig, resolve
+from leafflow_ti.errors import ConfigError
+from leafflow_ti.field import MOTION_NAMES
+from leafflow_ti.model_plan import cameras_read, check_model, fitted_motion, model_problem, sampling_of, static
+from leafflow_ti.models import MODELS, TensorLayout
 from leafflow_ti.range_plan import RangePlan, range_problem
-from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, OwnFlows, Problem, unknowns_of
-
-MOTION_NAMES = tuple(f"{q}_{a}" for q in ("velocity", "rotation", "acceleration") for a in "xyz")
+from leafflow_ti.refine_plan import Refinement, plan_refinement
+from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, Problem
 
 
 @dataclass(frozen=True)
@@ -37,6 +36,7 @@ class Plan:
     """What a run does; see the fields. Pixel positions of output row r and column c are ``y[r]``, ``x[c]``."""
 
     config: RunConfig
+    """Resolved: nothing in it that the capture or a preset decides is left open."""
     model: str
     problem: Problem
     layout: TensorLayout
@@ -55,6 +55,7 @@ class Plan:
     cache_bytes: int
     """Of these bytes, those of decoded images: kept where several bands need them and all of them fit, else 0."""
     ranges: RangePlan | None = None
+    refine: Refinement | None = None
 
     def reach(self, axis: str) -> int:
         """Pixels that a measurement needs on each side along an image axis."""
@@ -94,21 +95,35 @@ class Plan:
         if "x" in problem.terms:
             names += ["slope_x", "slope_y"]
         names += self.ranges.quantities if self.ranges else ()
-        names += MOTION_NAMES[: problem.unknowns]
+        names += self.refine.names if self.refine else MOTION_NAMES[: problem.unknowns]
         if "t" in problem.columns.solutions and not self.ranges:
             names += ["flow_x", "flow_y"]
         if problem.columns.index("i") is not None:
             names += [f"brightness_{a}" for a in problem.camera_axes]
         names += [BRIGHTNESS_MAPS[o] for o in problem.brightness]
         names += [WORLD_MAPS[o] for o in problem.world_brightness]
-        if "depth" in names and problem.unknowns >= 3:
+        if self._grows_by_differences:
             names.append("growth_rate")
-        return tuple(names)
+        return tuple(dict.fromkeys(names))
+
+    @property
+    def _grows_by_differences(self) -> bool:
+        """Whether growth is told from the velocities of neighbours; a refinement has it among its unknowns."""
+        measured = bool(self.problem.terms or self.ranges)
+        return measured and self.problem.unknowns >= 3 and self.refine is None
+
+    @property
+    def differences(self) -> bool:
+        """Whether differences between neighbouring output pixels are needed."""
+        return self._grows_by_differences and any(name.startswith("growth") for name in self.names)
 
     @property
     def margin(self) -> int:
-        """Output pixels around a band, and around the region, that are computed for the sake of those inside."""
-        return int(any(name.startswith("growth") for name in self.names))
+        """Output pixels around a band, and around the region, that are computed for the sake of those inside.
+
+        A pixel's growth is seen in its neighbours' velocities, and its refinement may start from theirs.
+        """
+        return int(self.differences or self.refine is not None)
 
     def band(self, index: int) -> slice:
         """Output rows of one band."""
@@ -154,6 +169,8 @@ class Plan:
                 )
             growing = " and growth" if own and own.growth else ""
             lines.append(f"motion      {problem.unknowns} unknowns{growing} from {' and '.join(taken)}")
+        if self.refine:
+            lines.append(self.refine.describe())
         pixels = len(self.frames) * len(self.y) * len(self.x)
         limit = self.config.plan.max_memory
         filters = self.config.filters
@@ -164,7 +181,7 @@ class Plan:
             f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
             f"{self.preshift[0]},{self.preshift[1]} px per step",
             f"frames      {self.frames[0]}..{self.frames[-1]} ({len(self.frames)})",
-            f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.config.window.stride}: "
+            f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.x.step}: "
             f"{', '.join(self.names)}",
             f"units       {self.n_units}: {self.bands} bands of up to {self.band_rows} rows per frame",
             f"memory      {self.bytes / 2**20:.0f} MiB for one unit, {self.read_ahead} frames read ahead, "
@@ -179,29 +196,31 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
 
     Raises ConfigError where the two do not fit, InputError where the capture is too small.
     """
-    name = resolve_model(config.model.name, capture.n_frames, capture.n_rows, capture.n_cols)
+    config = resolve(config, capture.n_frames, capture.n_rows, capture.n_cols)
+    name, stride = str(config.model.name), int(config.window.stride)
     model = MODELS[name]
     if not (model.ranges and config.range_flow.depth):
-        _check_model(name, capture)
+        check_model(name, capture)
     if config.filters.prefilter == "highpass" and config.model.brightness != "none":
         raise ConfigError(
             f"brightness '{config.model.brightness}' is relative to the grey value, which prefilter 'highpass' takes "
             "away: choose prefilter homomorphic, or brightness none"
         )
-    if config.model.deformation == "growth" and not model.own_flows:
+    if config.model.deformation == "growth" and not model.own_flows and not config.refine.steps:
         raise ConfigError(
-            f"deformation 'growth': model '{name}' cannot tell it from approach: choose affine-scene-flow"
+            f"deformation 'growth': model '{name}' cannot tell it from approach: choose affine-scene-flow, or a "
+            "refinement (--refine 3)"
         )
-    motion = _motion(config, name)
+    motion = fitted_motion(config, name)
     preshift, ranges = (0, 0), None
     if model.ranges:
-        own = None if config.range_flow.depth else _problem(capture, _static(config), "depth", None)
+        own = None if config.range_flow.depth else model_problem(capture, static(config), "depth", None)
         preshift = _preshift(capture, config) if own else (0, 0)
-        alone = _sampling(capture, config, "reference", True)
+        alone = sampling_of(capture, config, "reference", True)
         frames = _frames(capture, config, alone.t.radius, True)
         problem, ranges = range_problem(capture, config, alone, frames, own, preshift)
     else:
-        problem = _problem(capture, config, name, motion)
+        problem = model_problem(capture, config, name, motion)
         frames = _frames(capture, config, problem.sampling.t.radius, model.time)
         preshift = _preshift(capture, config) if problem.camera_axes else (0, 0)
     layout = TensorLayout.of(problem.columns)
@@ -211,164 +230,28 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         raise ConfigError(
             f"output.roi = {x0},{y0},{x1},{y1} reaches beyond the images of {size} pixels: make it smaller"
         )
-    x, y = range(x0, x1, config.window.stride), range(y0, y1, config.window.stride)
+    x, y = range(x0, x1, stride), range(y0, y1, stride)
     grid = (ranges.depth if ranges and ranges.depth else problem).sampling
-    cameras = _cameras(grid, problem.own_flows, *capture.reference)
+    cameras = cameras_read(grid, problem.own_flows, *capture.reference)
+    row, col = capture.reference
+    refine = plan_refinement(
+        config,
+        range(-problem.sampling.t.radius, problem.sampling.t.radius + 1) if model.time else None,
+        [(sx - col, sy - row) for sy in cameras[0] for sx in cameras[1]],
+        (capture.height, capture.width),
+    )
     plan = Plan(
         config, name, problem, layout, _geometry(capture),
-        cameras, preshift, frames, y, x, len(y), 0, 0, 0, ranges,
+        cameras, preshift, frames, y, x, len(y), 0, 0, 0, ranges, refine,
     )  # fmt: skip
     depths = (0,) if isinstance(capture, ArrayCapture) else range(READ_AHEAD, -1, -1)
-    demand = Demand(config, problem, layout, ranges, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))
+    demand = Demand(config, problem, layout, ranges, refine, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))
     band_rows, memory, ahead = choose_bands(demand, len(y), depths)
     plan = replace(plan, band_rows=band_rows, bytes=memory, read_ahead=ahead)
     cache = capture.cacheable_bytes if plan.bands > 1 else 0
     if cache > min(DEFAULT_CACHE_BYTES, usable_memory(config) - memory):
         cache = 0
     return replace(plan, bytes=memory + cache, cache_bytes=cache)
-
-
-def _sampling(capture: Capture, config: RunConfig, cameras: str, time: bool) -> Sampling:
-    """Filters and windows for ``cameras`` as ``models.Model`` has them, with or without a temporal axis."""
-    row, col = capture.reference
-    use_x = capture.n_cols > 1 and cameras != "reference"
-    use_y = capture.n_rows > 1 and (cameras == "grid" or (cameras == "line" and not use_x))
-    w = config.window
-    camera = ("cameras", config.filters.taps_camera, w.size_camera, w.sigma_camera, config.filters.taps)
-    frames = ("frames", config.filters.taps_time, w.size_time, w.sigma_time, config.filters.taps)
-    pixel = AxisSampling.gaussian(filter_set(config.filters.taps), w.size, w.sigma, w.stride)
-    return Sampling(
-        pixel,
-        pixel,
-        _series(capture.n_cols, col, *camera) if use_x else AxisSampling(),
-        _series(capture.n_rows, row, *camera) if use_y else AxisSampling(),
-        _series(capture.n_frames, capture.n_frames // 2, *frames, sequence=True) if time else AxisSampling(),
-    )
-
-
-def _static(config: RunConfig) -> RunConfig:
-    """The configuration for the depth of single frames, of every pixel: the motion's own choices do not concern it."""
-    model = config.model.model_copy(update={"brightness_terms": "none"})
-    window = config.window.model_copy(update={"stride": 1})
-    return config.model_copy(update={"model": model, "window": window})
-
-
-def _problem(capture: Capture, config: RunConfig, name: str, motion: str | None) -> Problem:
-    """What a model (but range flow) estimates."""
-    model = MODELS[name]
-    row, col = capture.reference
-    sampling = _sampling(capture, config, model.cameras, model.time)
-    columns = column_set(
-        model, config.model.brightness, sampling.camera_axes, sampling.sampled, config.model.brightness_terms
-    )
-    offsets: tuple[str, ...] = ("1",)
-    use_range, fitted, own = False, 0, None
-    if motion:
-        rows = config.model.rows if model.reference_rows else "2d"
-        offsets, use_range = parse_rows(rows, name, motion, columns)
-        fitted = unknowns_of(motion, columns)
-        n_rows = 2 * len(offsets) + use_range
-        if model.own_flows:
-            own = _own_flows(config, model, motion, offsets, sampling, (capture.n_rows, capture.n_cols), (row, col))
-            if motion == "translation":
-                fitted = min(fitted, n_rows)
-        if fitted > n_rows:
-            raise ConfigError(
-                f"motion '{motion}' has {fitted} unknowns, rows '{config.model.rows}' give {n_rows} equations: choose "
-                "more rows, a simpler motion, or more frames and cameras"
-            )
-    return Problem(
-        columns, sampling, config.model.estimator, config.model.solver, config.model.weighting == "wls",
-        offsets, use_range, fitted, own,
-    )  # fmt: skip
-
-
-def _motion(config: RunConfig, name: str) -> str | None:
-    """The motion that is fitted; None for a model without a 3D fit."""
-    wanted, motions = config.model.motion, MODELS[name].motions
-    if wanted != "auto" and wanted not in motions:
-        can = f"it measures {', '.join(motions)}" if motions else "it measures no 3D motion"
-        raise ConfigError(
-            f"motion '{wanted}': model '{name}' does not have it, {can}: choose --motion auto or another model"
-        )
-    return (motions[0] if wanted == "auto" else wanted) if motions else None
-
-
-def _own_flows(
-    config: RunConfig, model: Model, motion: str, offsets: tuple[str, ...], sampling: Sampling,
-    counts: tuple[int, int], reference: tuple[int, int],
-) -> OwnFlows:  # fmt: skip
-    """The flow of every camera but the one whose rows the reference model gives."""
-    if not model.reference_rows:
-        if config.model.rows not in ("auto", "u"):
-            raise ConfigError(
-                f"rows '{config.model.rows}': model 'scene-flow' takes the flow alone: choose rows u, or "
-                "affine-scene-flow"
-            )
-        offsets = ("1",)
-    alone = Sampling(sampling.x, sampling.y, t=sampling.t)
-    columns = column_set(OWN_FLOW, config.model.brightness, (), alone.sampled, config.model.brightness_terms)
-    steps = [(i - reference[1], j - reference[0]) for j in range(counts[0]) for i in range(counts[1])]
-    if model.reference_rows:
-        steps.remove((0, 0))
-    unknowns = unknowns_of(motion, columns, all_cameras=True)
-    kept = tuple(o for o in offsets if o == "1" or columns.index("x", o) is not None)
-    growth = "x" in kept if config.model.deformation == "auto" else config.model.deformation == "growth"
-    if growth and "x" not in kept:
-        raise ConfigError("deformation 'growth' is seen in the flow's derivatives: choose rows that begin with 2d")
-    return OwnFlows(columns, alone, tuple(steps), kept, unknowns, model.reference_rows, growth)
-
-
-def _cameras(sampling: Sampling, own: OwnFlows | None, row: int, col: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Rows and columns of the cameras that are read: those under filters and window, or every one."""
-
-    def reached(centre: int, radius: int, steps: Iterable[int]) -> tuple[int, ...]:
-        return tuple(range(centre + min(-radius, *steps), centre + max(radius, *steps) + 1))
-
-    steps = own.steps if own else ()
-    return (
-        reached(row, sampling.sy.radius, (0, *(s[1] for s in steps))),
-        reached(col, sampling.sx.radius, (0, *(s[0] for s in steps))),
-    )
-
-
-def _check_model(name: str, capture: Capture) -> None:
-    model = MODELS[name]
-    cameras = capture.n_rows * capture.n_cols
-    if model.ranges and cameras == 1:
-        raise ConfigError(
-            "model 'range-flow' needs a camera grid or range maps, the capture has one camera: give --depth"
-        )
-    if model.cameras != "reference" and cameras == 1:
-        raise ConfigError(f"model '{name}' needs a camera grid, the capture has one camera: choose flow or flow-affine")
-    if model.time and capture.n_frames < 3:
-        raise ConfigError(f"model '{name}' needs at least 3 frames, the capture has {capture.n_frames}: choose depth")
-    if name == "affine-5d" and min(capture.n_rows, capture.n_cols) == 1:
-        grid = f"{capture.n_rows} x {capture.n_cols}"
-        raise ConfigError(f"model 'affine-5d' needs a 2D camera grid, the capture has {grid}: choose affine-4d")
-
-
-def _series(
-    n: int, centre: int, what: str, taps: str, size: int | str, sigma: float, largest: str, sequence: bool = False
-) -> AxisSampling:
-    """Filters and window along a camera or time axis of ``n`` samples."""
-    usable = n if sequence else 2 * min(centre, n - 1 - centre) + 1
-    usable -= 1 - usable % 2
-    chosen = choose_filter_set(usable, largest) if taps == "auto" else filter_set(taps)
-    if chosen is None or 2 * chosen.radius + 1 > usable:
-        needed = 3 if chosen is None else 2 * chosen.radius + 1
-        raise InputError(
-            f"{n} {what} are too few: {needed} around the middle one are needed: record more, or use 3 taps"
-        )
-    longest = usable - 2 * chosen.radius
-    if size == "auto":
-        size = min(5, longest)
-    if int(size) > longest:
-        raise ConfigError(
-            f"a window of {size} {what} with {2 * chosen.radius + 1} taps is too long, {usable} lie around the middle: "
-            f"choose a window of at most {longest}, or fewer taps"
-        )
-    return AxisSampling.gaussian(chosen, int(size), sigma)
 
 
 def _frames(capture: Capture, config: RunConfig, radius: int, has_time: bool) -> tuple[int, ...]:

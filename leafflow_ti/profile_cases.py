@@ -45,7 +45,9 @@ CASES: dict[str, Case] = {
         "the same, every fourth pixel", _SCENE, ("model.name=affine-4d", "window.stride=4", *_COMMON)
     ),
     "affine-scene-flow": Case(
-        "the default model on the same capture", _SCENE, ("model.name=affine-scene-flow", *_COMMON)
+        "the default model on the same capture, without its refinement",
+        _SCENE,
+        ("model.name=affine-scene-flow", "refine.steps=0", *_COMMON),
     ),
     "depth": Case(
         "depth and normals from one frame of it", replace(_SCENE, n_frames=1), ("model.name=depth", *_COMMON)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.errors import MissingExtra, RunError
-from leafflow_ti.field import Field, quantity
+from leafflow_ti.field import STRAIN_NAMES, Field, quantity
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 
@@ -36,11 +36,12 @@ STATUS_COLOURS: dict[Status, str] = {
     Status.BORDER: "#c3d0dc",
     Status.MASKED: "#1f1f24",
     Status.NOT_FINITE: "#e88fb0",
+    Status.UNREFINED: "#5b9bd0",
     Status.NOT_COMPUTED: "#f7f7f7",
 }
 """Colour of each status in the pictures."""
 
-SIGNED = ("growth_rate",)
+SIGNED = ("growth_rate", *STRAIN_NAMES)
 """Maps whose colours diverge about zero even where all values have one sign."""
 
 _DPI = 120
@@ -119,7 +120,7 @@ def _pages(field: Field) -> dict[str, list[_Panel]]:
         if base != "rotation" and f"{base}_x" in field and f"{base}_y" in field:
             pages[page] = [*panels, partial(_draw_arrows, field, base)]
     if "growth_rate" in field:
-        pages["growth"] = _maps(field, ["growth_rate", "growth_rate_std"])
+        pages["growth"] = _maps(field, ["growth_rate", "growth_rate_std", *STRAIN_NAMES])
         overview += pages["growth"][:1]
     return {**pages, "status": [partial(_draw_status, field)], "overview": overview}
 

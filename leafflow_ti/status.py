@@ -9,7 +9,7 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """One byte per pixel; everything but ``OK`` and ``APERTURE`` has NaN maps."""
+    """One byte per pixel; all maps are NaN but for the codes in ``HAS_VALUE``."""
 
     OK = 0
     NO_STRUCTURE = 1
@@ -19,6 +19,7 @@ class Status(IntEnum):
     BORDER = 5
     MASKED = 6
     NOT_FINITE = 7
+    UNREFINED = 8
     NOT_COMPUTED = 255
 
 
@@ -31,9 +32,10 @@ ADVICE: dict[Status, str] = {
     Status.BORDER: "the window reaches beyond an image: a smaller one, or --border clip, measures closer to the edge",
     Status.MASKED: "outside the given mask",
     Status.NOT_FINITE: "the images hold NaN or infinite grey values here",
+    Status.UNREFINED: "the exact refinement did not converge or fitted no better: the values are those before it",
     Status.NOT_COMPUTED: "not computed yet, or outside the region of interest",
 }
 """One sentence of advice for each status."""
 
-HAS_VALUE = (Status.OK, Status.APERTURE)
+HAS_VALUE = (Status.OK, Status.APERTURE, Status.UNREFINED)
 """Codes whose maps hold numbers."""

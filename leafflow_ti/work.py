@@ -101,9 +101,9 @@ def _power(exponents: tuple[int, ...], axis: str) -> int:
 
 def count_work(plan: Plan) -> dict[str, Work]:
     """Work of each of ``STAGES`` per output pixel of one more frame."""
-    problem, stride = plan.problem, plan.config.window.stride
+    problem, stride = plan.problem, plan.x.step
     block = problem.sampling.x.blocked.step
-    total = _count(problem, plan.layout, plan.config.precision, stride, block, len(plan.names), bool(plan.margin))
+    total = _count(problem, plan.layout, plan.config.precision, stride, block, len(plan.names), plan.differences)
     if plan.ranges and plan.ranges.depth and plan.ranges.layout:
         # Range flow measures the depth of every input pixel first.
         depth = _count(plan.ranges.depth, plan.ranges.layout, plan.config.precision, 1, 1, 4, False)

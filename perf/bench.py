@@ -68,10 +68,11 @@ class Scene:
         return capture_from_array(images, Geometry(scene.f_px, scene.principal, (scene.baseline_mm[0], 0.0)))
 
     def options(self, capture: Capture, **further: Any) -> dict[str, Any]:
-        """Options of ``estimate`` for the middle frame, the output in the middle of the images."""
+        """Options of ``estimate`` for the middle frame, the output in the middle of the images, not refined."""
         x0, y0 = (capture.width - self.out_px) // 2, self.margin
         return {
-            "model": "affine-4d", "preshift": (self.preshift_px, 0), "window": self.window, "sigma": self.sigma,
+            "model": "affine-4d", "refine": 0, "preshift": (self.preshift_px, 0), "window": self.window,
+            "sigma": self.sigma,
             "frames": f"{self.frames // 2}:{self.frames // 2 + 1}", "tile": self.out_px,
             "roi": (x0, y0, x0 + self.out_px, y0 + self.out_px), **further,
         }  # fmt: skip
@@ -123,7 +124,7 @@ class Stages:
     def of(cls, plan: Plan, capture: Capture, device: Device) -> Stages:
         """Builds the stages; compiles nothing."""
         problem = plan.problem
-        band = Band.of(problem.sampling, len(plan.y), len(plan.x), plan.config.window.stride)
+        band = Band.of(problem.sampling, len(plan.y), len(plan.x), plan.x.step)
         tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band)
         view = _view(plan, band, tensor.out_pitch)
         estimate = EstimateStage(device, problem, plan.layout, view, bool(plan.margin))

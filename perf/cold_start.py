@@ -25,7 +25,7 @@ SECOND_GOAL_S = 5.0
 
 @dataclass(frozen=True)
 class Settings:
-    """A cube of 9 cameras and 9 frames: the default model is affine-4d with rotation. ``repeats``: warm processes."""
+    """A cube of 9 cameras and 9 frames: affine-scene-flow and its refinement. ``repeats``: warm processes."""
 
     size: str = "256x160"
     options: tuple[str, ...] = ("--frames", "4:5")

@@ -47,7 +47,7 @@ class NumbaTwin:
         """Packed tensors [entries, rows, cols] from the maps of 5 frames."""
         t, plan = self.tables, self.plan
         out = np.empty((len(plan.layout.entries), len(plan.y), len(plan.x)), np.float32)
-        stride = plan.config.window.stride
+        stride = plan.x.step
         moment_windows(maps, self._time, self._y, self._x, t.tall, t.first, t.wide, stride, out)
         return out
 

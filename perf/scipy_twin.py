@@ -185,7 +185,7 @@ def texture(channels: dict[str, Array], sampling: Sampling) -> tuple[Array, Arra
 
 def windows(maps: dict[Any, Array], energies: tuple[Array, Array], plan: Plan, windowing: Windowing) -> Tensors:
     """Moment windows along y, then along x, of everything that an entry of the structure tensor is made of."""
-    sampling, stride = plan.problem.sampling, plan.config.window.stride
+    sampling, stride = plan.problem.sampling, plan.x.step
     y, x = AXES.index("y"), AXES.index("x")
     tall: dict[Any, Array] = {}
     for moment in plan.layout.moments:

@@ -67,7 +67,7 @@ class TorchTwin:
 
     def tensor(self, maps: Any) -> Any:
         """Packed tensors [entries, rows, cols] from the maps [5, maps, in_rows, in_cols] of 5 frames."""
-        tables, stride = self.tables, self.plan.config.window.stride
+        tables, stride = self.tables, self.plan.x.step
         out = torch.empty(len(self.plan.layout.entries), len(self.plan.y), len(self.plan.x))
         for i, (plane, q, n) in enumerate(tables.tall.tolist()):
             summed = torch.tensordot(self._time[q], maps[:, plane], dims=1)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from reference import chain
 
+from leafflow_ti.field import MOTION_NAMES
 from leafflow_ti.filters import filter_set
 from leafflow_ti.growth import DIFFERENCES
 from leafflow_ti.models import BRIGHTNESS, MODELS, OWN_FLOW, ColumnSet, TensorLayout, column_set, parse_rows
-from leafflow_ti.plan import MOTION_NAMES
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import EstimateStage, View

@@ -207,7 +207,7 @@ def test_options_become_the_configuration(api: FakeApi, capture: Path, tmp_path:
         "--estimator": "ols", "--solver": "jacobi", "--weighting": "ls", "--window": 33, "--sigma": 7.5, "--stride": 3,
         "--taps": "7", "--prefilter": "homomorphic", "--sigma-pre": 5.5, "--frames": "0:1", "--roi": "1,2,30,40",
         "--mask": "m.tif", "--preshift": "-3,0", "--precision": "f64", "--arch": "cpu", "--max-memory": "1G",
-        "--threads": 2,
+        "--threads": 2, "--deformation": "strain", "--refine": 4, "--refine-window": 41, "--thin": 2,
     }  # fmt: skip
     assert call("run", capture, "--dry-run", *[part for pair in given.items() for part in pair]) == 0
     expected = config.load_config(overrides={key.lstrip("-").replace("-", "_"): v for key, v in given.items()})
@@ -317,7 +317,19 @@ def test_run_without_capture_exits_with_4_or_3(
 
 
 @pytest.mark.parametrize(
-    "name", ["Preset", "Motion", "Brightness", "Estimator", "Solver", "Weighting", "Prefilter", "Precision", "Arch"]
+    "name",
+    [
+        "Preset",
+        "Motion",
+        "Deformation",
+        "Brightness",
+        "Estimator",
+        "Solver",
+        "Weighting",
+        "Prefilter",
+        "Precision",
+        "Arch",
+    ],
 )
 def test_choices_in_the_help_are_those_of_the_configuration(name: str) -> None:
     assert get_args(getattr(options, name))[1].metavar == "|".join(get_args(getattr(config, name)))

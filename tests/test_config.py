@@ -13,10 +13,11 @@ from leafflow_ti.config import (
     RunConfig,
     WindowSection,
     load_config,
-    resolve_model,
+    resolve,
 )
 from leafflow_ti.config_values import machine_memory, parse_memory
 from leafflow_ti.errors import ConfigError
+from leafflow_ti.presets import PRESETS, resolve_model
 
 
 def write(folder: Path, text: str) -> Path:
@@ -28,26 +29,67 @@ def write(folder: Path, text: str) -> Path:
 def test_defaults_are_those_of_the_contract() -> None:
     config = load_config()
     assert (config.preset, config.precision, config.arch, config.preshift) == ("balanced", "f32", "auto", "auto")
-    assert (config.window.size, config.window.sigma, config.window.stride) == (65, 19.0, 1)
+    assert (config.window.size, config.window.sigma, config.window.stride) == (65, 19.0, "auto")
     assert (config.window.size_time, config.window.sigma_time) == ("auto", 1.0)
     assert (config.model.name, config.model.motion, config.model.rows) == ("auto", "auto", "auto")
     assert (config.model.estimator, config.model.solver, config.model.weighting) == ("tls-equilibrated", "fast", "wls")
     assert (config.filters.taps, config.filters.taps_time) == ("5", "auto")
     assert config.plan.max_memory == machine_memory() // 2
+    assert (config.refine.steps, config.refine.window, config.refine.thin) == ("auto", "auto", "auto")
     assert config.output.roi is None
 
 
-@pytest.mark.parametrize(("preset", "stride", "precision"), [("fast", 4, "f32"), ("accurate", 1, "f64")])
-def test_preset_decides_what_is_not_given(preset: str, stride: int, precision: str) -> None:
-    config = load_config(overrides={"preset": preset})
-    assert (config.window.stride, config.precision) == (stride, precision)
+def resolved(*grid: int, **options: object) -> RunConfig:
+    """For a capture of so many frames, rows and columns of cameras; by default 9, 1 and 9."""
+    return resolve(load_config(overrides=options), *(grid or (9, 1, 9)))
+
+
+def refinement(config: RunConfig) -> tuple[object, ...]:
+    return config.refine.steps, config.refine.window, config.refine.thin
+
+
+@pytest.mark.parametrize(
+    ("preset", "precision", "steps", "thin", "stride", "unrefined_stride"),
+    [("fast", "f32", 0, 3, 4, 4), ("balanced", "f32", 3, 3, 4, 1), ("accurate", "f64", 8, 2, 4, 1)],
+)
+def test_preset_decides_what_is_not_given(
+    preset: str, precision: str, steps: int, thin: int, stride: int, unrefined_stride: int
+) -> None:
+    config = resolved(preset=preset)
+    assert (config.model.name, config.precision, config.window.stride) == ("affine-scene-flow", precision, stride)
+    assert refinement(config) == (steps, 65, thin)
+    for other in (resolved(preset=preset, model="affine-4d"), resolved(1, 9, 9, preset=preset)):
+        assert (other.refine.steps, other.window.stride) == (0, unrefined_stride)
 
 
 def test_explicit_values_win_over_the_preset() -> None:
     config = load_config(sets=["window.stride=2", "precision=f32"], overrides={"preset": "accurate"})
     assert (config.window.stride, config.precision) == (2, "f32")
-    assert RunConfig(preset="fast", window=WindowSection(size=33)).window.stride == 4
-    assert RunConfig(preset="fast", window=WindowSection(stride=1)).window.stride == 1
+    assert resolved(stride=1, refine=5).window.stride == 1
+    assert refinement(resolved(stride=1, refine=5, refine_window=33, thin=2)) == (5, 33, 2)
+    assert resolved(refine=0).window.stride == 1
+    assert resolved(preset="fast", stride=1).window.stride == 1
+    on_demand = resolved(preset="fast", refine=2, model="affine-4d", stride=1)
+    assert (on_demand.refine.steps, on_demand.window.stride) == (2, 1)
+    assert resolved(model="affine-4d", refine=2).window.stride == 4
+
+
+@pytest.mark.parametrize(
+    ("size", "window", "thin", "accurate"), [(3, 9, 1, 1), (41, 41, 1, 1), (65, 65, 3, 2), (129, 129, 6, 2)]
+)
+def test_refinement_follows_the_window(size: int, window: int, thin: int, accurate: int) -> None:
+    assert refinement(resolved(window=size)) == (3, window, thin)
+    assert refinement(resolved(window=size, preset="accurate")) == (8, window, accurate)
+    assert refinement(resolved(window=size, preset="accurate", thin=4)) == (8, window, 4)
+
+
+def test_resolving_decides_everything_and_once() -> None:
+    for preset in PRESETS:
+        for grid in ((9, 1, 1), (1, 3, 3), (9, 5, 5)):
+            config = resolved(*grid, preset=preset)
+            values = (config.model.name, config.window.stride, *refinement(config))
+            assert "auto" not in values
+            assert resolve(config, *grid) == config
 
 
 def test_precedence_file_then_set_then_option(tmp_path: Path) -> None:
@@ -104,6 +146,11 @@ def test_configuration_is_frozen() -> None:
         ("window.sigma=-1", ["window.sigma = '-1'", "greater than 0"]),
         ("window.sigma=nan", ["window.sigma", "finite"]),
         ("window.stride=0", ["integer >= 1"]),
+        ("refine.steps=51", ["refine.steps = '51'", "from 0 to 50", '"auto"']),
+        ("refine.window=7", ["refine.window = '7'", "odd integer >= 9"]),
+        ("refine.thin=0", ["integer >= 1"]),
+        ("refine=3", ["refine (--set)", "refine.steps"]),
+        ("model.deformation=stretch", ["'growth' or 'strain'"]),
         ("model.estimator=best", ["model.estimator = 'best'", "'ols', 'tls' or 'tls-equilibrated'"]),
         ("model.rows=2d+b5+b5", ["2d+b5+b5", "+b5, +as, +at"]),
         ("filters.taps=9", ["filters.taps = '9'", "'3x1x1', '3', '5' or '7'"]),

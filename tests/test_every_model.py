@@ -105,7 +105,7 @@ def test_model(
     out = tmp_path / "out.zarr"
     choice = {
         "model": model, "preshift": PRESHIFT[grid], "window": 15, "sigma": 4.4, "stride": 4, "precision": "f64",
-        "frames": "3:4", "roi": "43,39,52,40", **given,
+        "frames": "3:4", "roi": "43,39,52,40", "refine": 0, **given,
     }  # fmt: skip
     arguments = [a for key, value in choice.items() for a in (f"--{key}", value)]
     assert call("run", folder, "-o", out, "--quiet", "--no-quicklook", *arguments) == 0

@@ -114,7 +114,7 @@ def cube_images() -> np.ndarray:
 def cube_field(model: str) -> tuple[lf.Field, dict[str, np.ndarray]]:
     """The default cube and its truth at the output pixels; ``face`` is 0 where a window sees more than one face."""
     scene = cube.CubeScene()
-    options = {**OPTIONS, "model": model, "motion": "auto"}
+    options = {**OPTIONS, "model": model, "motion": "auto", "refine": 0}
     field = lf.estimate(capture_of(scene, cube_images()), **options, stride=8)
     exact = cube.truth(scene)
     face = exact["face"]

@@ -215,7 +215,14 @@ def test_little_memory_means_less_reading_ahead(on_disk: tuple[Path, np.ndarray]
     files = lf.open_capture(on_disk[0])
 
     def planned(**limit: object) -> Plan:
-        large = {"model": "affine-scene-flow", "window": 31, "prefilter": "highpass", "sigma_pre": 80, "tile": 43}
+        large = {
+            "model": "affine-scene-flow",
+            "refine": 0,
+            "window": 31,
+            "prefilter": "highpass",
+            "sigma_pre": 80,
+            "tile": 43,
+        }
         return lf.plan_run(files, config(**large, **limit))
 
     plenty = planned()
@@ -335,7 +342,7 @@ def test_kept_stages_measure_as_new_ones(capture: Capture) -> None:
     """Stages that have seen other images, invalid pixels among them, and another region give the same bits."""
     from leafflow_ti import engines
 
-    options = OPTIONS | {"model": "affine-scene-flow", "frame": 6, "roi": (14, 10, 46, 34)}
+    options = OPTIONS | {"model": "affine-scene-flow", "refine": 0, "frame": 6, "roi": (14, 10, 46, 34)}
     images = capture.block(range(13), (0,), range(5), 0, 43, 0, 61, (0, 0), np.float32)
     spoilt = images.copy()
     spoilt[6, 0, 2, 20, 30] = np.nan

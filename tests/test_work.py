@@ -24,7 +24,9 @@ def capture(n_cameras: int) -> Capture:
 
 
 def plan(n_cameras: int = 9, **options: Any) -> Plan:
-    return make_plan(capture(n_cameras), load_config(overrides={"window": 33, "preshift": (0, 0), **options}))
+    return make_plan(
+        capture(n_cameras), load_config(overrides={"window": 33, "preshift": (0, 0), "refine": 0, **options})
+    )
 
 
 def test_optical_flow_is_counted_as_by_hand() -> None:

@@ -11,14 +11,15 @@ import typer
 from leafflow_ti.cli.run import quicklook_folder
 from leafflow_ti.errors import UsageError
 
-SMALL: tuple[list[str], list[str]] = (["--size", "400x260"], ["--window", "41", "--stride", "2"])
+SMALL: tuple[list[str], list[str]] = (["--size", "400x260"], ["--window", "41"])
 FULL: tuple[list[str], list[str]] = (["--size", "301x301"], [])
-"""Options of ``simulate cube`` and of ``run``; the full one has the window and image size of the dissertation."""
+"""Options of ``simulate cube`` and of ``run``; the full one has the window and image size of the
+dissertation. All else is the default, refinement included."""
 
 
 def demo(
     folder: Annotated[Path, typer.Argument(metavar="OUTDIR", help="Folder to create.")] = Path("leafflow-demo"),
-    full: Annotated[bool, typer.Option("--full", help="Images of 301 x 301 px, window of 65 px, every pixel.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Images of 301 x 301 px, window of 65 px.")] = False,
 ) -> None:
     """Simulate a rotating cube, measure it, compare with the truth, draw pictures.
 
@@ -32,7 +33,10 @@ def demo(
     capture, out = folder / "cube", folder / "cube.zarr"
     for title, arguments in (
         ("A synthetic capture with its exact truth", ["simulate", "cube", str(capture), *scene]),
-        ("Depth, normals and 3D motion of every pixel", ["run", str(capture), "-o", str(out), *settings]),
+        (
+            "Depth, normals, 3D motion and growth, refined on the exact patch",
+            ["run", str(capture), "-o", str(out), *settings],
+        ),
         ("Compared with the truth", ["evaluate", str(out), "--truth", str(capture / "truth.npz")]),
     ):
         typer.echo(f"\n# {title}\n$ leafflow-ti {shlex.join(arguments)}")

@@ -19,7 +19,9 @@ def _text(name: str, metavar: str, help: str) -> Any:
     return typer.Option(f"--{name}", metavar=metavar, help=help, show_default=False)
 
 
-Preset = Annotated[str | None, _text("preset", "fast|balanced|accurate", "Stride and precision at once [balanced].")]
+Preset = Annotated[
+    str | None, _text("preset", "fast|balanced|accurate", "Stride, precision and refinement at once [balanced].")
+]
 Model = Annotated[
     str | None,
     _text(
@@ -35,7 +37,11 @@ Motion = Annotated[
 ]
 Deformation = Annotated[
     str | None,
-    _text("deformation", "auto|none|growth", "Whether the surface may grow [auto: growth with affine-scene-flow]."),
+    _text(
+        "deformation",
+        "auto|none|growth|strain",
+        "Whether the surface may grow or, refined, stretch [auto: growth with affine-scene-flow or refinement].",
+    ),
 ]
 Rows = Annotated[
     str | None, _text("rows", "auto|(u|2d)[+b5][+as][+at]", "Flow parameters that enter the 3D fit [auto].")
@@ -61,10 +67,30 @@ Solver = Annotated[str | None, _text("solver", "fast|jacobi", "Null-space solver
 Weighting = Annotated[str | None, _text("weighting", "wls|ls", "3D fit weighted by covariance, or not [wls].")]
 Window = Annotated[int | None, _text("window", "PIXELS", "Side of the window, odd [65].")]
 Sigma = Annotated[float | None, _text("sigma", "PIXELS", "Gaussian width of the window [19/65 of its side].")]
-Stride = Annotated[int | None, _text("stride", "PIXELS", "Measure every STRIDE-th pixel [1; preset fast: 4].")]
+Stride = Annotated[
+    str | None,
+    _text("stride", "auto|PIXELS", "Measure every PIXELS-th pixel [auto: 4 where refined, else 1; fast: 4]."),
+]
 Border = Annotated[
     str | None,
     _text("border", "full|clip", "Where the whole window is inside, or up to the border [full]."),
+]
+Refine = Annotated[
+    str | None,
+    _text(
+        "refine",
+        "auto|STEPS",
+        "Steps of the exact refinement, 0 for none [auto: 3 with affine-scene-flow, else 0; accurate: 8; fast: 0].",
+    ),
+]
+RefineWindow = Annotated[
+    str | None, _text("refine-window", "auto|PIXELS", "Side of the refinement's window, odd [auto: that of --window].")
+]
+Thin = Annotated[
+    str | None,
+    _text(
+        "thin", "auto|PIXELS", "The refinement takes every PIXELS-th pixel [auto: a 21st of its window; accurate: 2]."
+    ),
 ]
 Taps = Annotated[str | None, _text("taps", "3x1x1|3|5|7", "Derivative filters [5].")]
 Prefilter = Annotated[
@@ -91,7 +117,8 @@ SETTINGS: dict[str, Any] = {
     "preset": Preset, "model": Model, "motion": Motion, "deformation": Deformation, "rows": Rows,
     "brightness": Brightness, "brightness_terms": BrightnessTerms, "constraint": Constraint, "beta": Beta,
     "depth": Depth, "estimator": Estimator, "solver": Solver, "weighting": Weighting, "window": Window,
-    "sigma": Sigma, "stride": Stride, "border": Border, "taps": Taps, "prefilter": Prefilter,
+    "sigma": Sigma, "stride": Stride, "border": Border,
+    "refine": Refine, "refine_window": RefineWindow, "thin": Thin, "taps": Taps, "prefilter": Prefilter,
     "sigma_pre": SigmaPre, "frames": Frames, "roi": Roi, "mask": Mask, "preshift": Preshift,
     "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads,
 }  # fmt: skip

@@ -13,8 +13,9 @@ Scene = PlaneScene | CubeScene
 Statistic = Literal["mean", "std", "rms"]
 Pair = tuple[str, str]
 
-STANDARD: dict[str, Any] = {"window": 65, "sigma": 19.0}
-"""Windows of the dissertation: 65 pixels, sigma 19; along cameras and time its 5 samples, sigma 1, are the default."""
+STANDARD: dict[str, Any] = {"window": 65, "sigma": 19.0, "refine": 0}
+"""Windows of the dissertation: 65 pixels, sigma 19; along cameras and time its 5 samples, sigma 1, are the default. Its
+models are not refined."""
 
 
 class Quantity(NamedTuple):

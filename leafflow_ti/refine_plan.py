@@ -1,0 +1,169 @@
+"""The plan of the exact refinement: which samples of which images, which unknowns; and the filter of the images.
+
+A pure value; stages and kernels read it.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.config import RunConfig
+from leafflow_ti.errors import ConfigError
+from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
+from leafflow_ti.presets import REFINED_WINDOW
+
+Array = NDArray[np.float64]
+
+PREFILTER_SIGMA = 0.85
+"""Gaussian of the images [px]: below, interpolation errs; above, texture is lost."""
+PIXEL_VARIANCE = 1 / 12
+"""Variance of a pixel's area [px²], over which the sensor has averaged already."""
+SUPPORT = 2
+"""Reach of a cubic B-spline [px]."""
+LEAST_TAP = 1e-7
+"""Taps below this share of the largest are left out: the rounding of single precision."""
+
+_TERMS = {"none": 0, "temporal": 1, "spatial": 3, "camera": 6}
+"""Brightness model -> photometric terms of an image: gain; its slopes; its curvatures."""
+
+
+@functools.cache
+def filter_taps() -> Array:
+    """Symmetric kernel from grey values to cubic B-spline coefficients of the smoothed image, float64 [2 radius + 1].
+
+    A Gaussian of ``PREFILTER_SIGMA`` and the inverse of the sampled spline (1/6, 4/6, 1/6), which is ``√3 z^|k|`` with
+    ``z = √3 - 2``, along one axis; the sum is 1.
+    """
+    offset = np.arange(-64, 65)
+    gaussian = np.exp(-0.5 * (offset / PREFILTER_SIGMA) ** 2)
+    inverse = math.sqrt(3) * (math.sqrt(3) - 2) ** np.abs(offset)
+    taps = np.convolve(gaussian, inverse, "same")
+    taps = (taps + taps[::-1]) / 2  # symmetric to the last bit
+    radius = int(np.abs(offset[np.abs(taps) >= LEAST_TAP * taps.max()]).max())
+    taps = taps[64 - radius : 64 + radius + 1]
+    taps = np.asarray(taps / taps.sum())
+    taps.flags.writeable = False  # shared by all who ask
+    return taps
+
+
+FILTER_RADIUS = len(filter_taps()) // 2
+"""Pixels that a coefficient needs on each side."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """At most ``steps`` Gauss-Newton steps on the exact moving patch.
+
+    ``size``, ``sigma``: Gaussian window [px], of which every ``thin``-th pixel around the centre is a sample.
+    ``frames``: offsets from the reference frame; ``cameras``: (x, y) steps from the reference camera, in the order of
+    a block's images (rows, then columns). Unknowns are depth and slopes (Z0, ZX, ZY); ``motion``: how many of
+    (N, Ω, A): 0, 3, 6 or 9; ``modes`` of the deformation in the patch's plane: 0, 1 (growth alike in all directions),
+    3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6.
+    """
+
+    steps: int
+    size: int
+    sigma: float
+    thin: int
+    frames: tuple[int, ...]
+    cameras: tuple[tuple[int, int], ...]
+    motion: int
+    modes: int
+    terms: int
+
+    @property
+    def unknowns(self) -> int:
+        """Unknowns of a pixel, photometric terms and texture left out."""
+        return 3 + self.motion + self.modes
+
+    @property
+    def across(self) -> int:
+        """Samples along one axis of the window."""
+        return samples_across(self.size, self.thin)
+
+    @property
+    def reach(self) -> int:
+        """Pixels that a sample may lie from its place in the preshifted window."""
+        steps = max(max(abs(x), abs(y)) for x, y in self.cameras)
+        return steps + 2 * max(abs(t) for t in self.frames) + 4
+
+    @property
+    def halo(self) -> int:
+        """Pixels of the images that a measurement needs on each side."""
+        return self.size // 2 + self.reach + SUPPORT + FILTER_RADIUS
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Maps that are measured, in the order of the unknowns; strain rates stand behind the growth they make up."""
+        growth = ("growth_rate",) if self.modes else ()
+        strain = STRAIN_NAMES if self.modes == 3 else ()
+        return ("depth", "slope_x", "slope_y", *MOTION_NAMES[: self.motion], *growth, *strain)
+
+    def describe(self) -> str:
+        """One line of the plan."""
+        modes = {0: "no deformation", 1: "growth", 3: "strain"}[self.modes]
+        return (
+            f"refinement  at most {self.steps} steps, window of {self.size} px thinned by {self.thin} "
+            f"({self.across**2} samples), {len(self.frames)} frames of {len(self.cameras)} cameras; {self.unknowns} "
+            f"unknowns (depth, slopes, {self.motion} of motion, {modes}), {self.terms} photometric terms an image"
+        )
+
+
+def samples_across(size: int, thin: int) -> int:
+    """Samples along one axis of a window of ``size`` pixels: every ``thin``-th around its centre."""
+    return 2 * (size // 2 // thin) + 1
+
+
+def plan_refinement(
+    config: RunConfig, temporal: range | None, cameras: Iterable[tuple[int, int]], image: tuple[int, int]
+) -> Refinement | None:
+    """The refinement that a resolved configuration asks for; None: none.
+
+    ``temporal``: frame offsets under filters and window of the model, None if it is static; ``cameras``: as of
+    ``Refinement``, all that are read; ``image``: rows and columns. Raises ConfigError where they do not fit.
+    """
+    model, window, cameras = config.model, config.window, tuple(cameras)
+    steps, size, thin = (int(value) for value in (config.refine.steps, config.refine.window, config.refine.thin))
+    if not steps:
+        if model.deformation == "strain":
+            raise ConfigError(
+                "deformation 'strain' is measured by the refinement alone: give --refine 3, or choose growth"
+            )
+        return None
+    if len(cameras) == 1:
+        raise ConfigError(
+            f"refine.steps = {steps}: model '{model.name}' reads one camera, and depth is refined from several: choose "
+            "a model of a camera grid, or --refine 0"
+        )
+    if temporal is None and model.deformation in ("growth", "strain"):
+        raise ConfigError(
+            f"deformation '{model.deformation}': model '{model.name}' is static: choose deformation none, or a model "
+            "with time"
+        )
+    if size > min(image):
+        raise ConfigError(
+            f"refine.window = {size}: the images have {image[1]} x {image[0]} pixels: choose a --refine-window of at "
+            f"most {min(image) - 1 + min(image) % 2}, or --refine 0"
+        )
+    if samples_across(size, thin) < REFINED_WINDOW:
+        most = size // 2 // (REFINED_WINDOW // 2)
+        raise ConfigError(
+            f"refine.thin = {thin} leaves {samples_across(size, thin)} samples across a window of {size} px, "
+            f"{REFINED_WINDOW} are needed: choose --thin {most} at most, or a larger --refine-window"
+        )
+    motion, modes = 0, 0
+    if temporal is not None:
+        # A point that turns accelerates by ω²R: without A among the unknowns it is the velocity that errs.
+        motion = 3 if model.motion == "translation" else 9
+        modes = {"none": 0, "strain": 3}.get(model.deformation, 1)
+    curved = model.brightness != "none" and model.brightness_terms in ("space", "both")
+    terms = 6 if curved else _TERMS[model.brightness]
+    sigma = window.sigma * size / window.size
+    frames = tuple(temporal or (0,))
+    return Refinement(steps, size, sigma, thin, frames, cameras, motion, modes, terms)

@@ -1,0 +1,181 @@
+"""The plan of the refinement: the filter of its images, what is refined where, what is refused, memory and maps."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter1d
+
+from leafflow_ti.capture import Capture, Geometry, capture_from_array
+from leafflow_ti.config import load_config
+from leafflow_ti.errors import ConfigError
+from leafflow_ti.plan import Plan, make_plan
+from leafflow_ti.refine_plan import FILTER_RADIUS, LEAST_TAP, PREFILTER_SIGMA, Refinement, filter_taps
+
+
+def test_filter_is_a_gaussian_and_the_splines_own() -> None:
+    """Against SciPy's recursive filter; what is cut off are taps below 1e-7 of the largest."""
+    taps = filter_taps()
+    assert len(taps) == 2 * FILTER_RADIUS + 1
+    np.testing.assert_array_equal(taps, taps[::-1])
+    assert taps.sum() == pytest.approx(1, abs=1e-15)
+    assert np.abs(taps).min() >= LEAST_TAP * taps.max()
+    row = np.random.default_rng(0).uniform(0, 255, 200)
+    wanted = spline_filter1d(gaussian_filter(row, PREFILTER_SIGMA, truncate=8, mode="mirror"), 3, mode="mirror")
+    # Twice the first tap left out, .27 of the last, and the geometric tail behind it; far from the ends.
+    inner = slice(60, -60)
+    np.testing.assert_allclose(np.convolve(row, taps, "same")[inner], wanted[inner], atol=255 * 1e-7)
+
+
+def test_spline_of_the_coefficients_is_the_smoothed_image() -> None:
+    row = np.random.default_rng(1).uniform(0, 255, 200)
+    coefficients = np.convolve(row, filter_taps(), "same")
+    at = np.arange(60, 140)
+    found = map_coordinates(coefficients, at[None], order=3, prefilter=False, mode="mirror")
+    np.testing.assert_allclose(found, gaussian_filter(row, PREFILTER_SIGMA, truncate=8)[at], atol=255 * 1e-7)
+
+
+def capture(frames: int = 9, rows: int = 1, cols: int = 9, size: tuple[int, int] = (96, 128)) -> Capture:
+    images = np.zeros((frames, rows, cols, *size), np.float32)
+    return capture_from_array(images, Geometry(1000.0, ((size[1] - 1) / 2, (size[0] - 1) / 2), (1.0, 1.0)))
+
+
+def plan(of: Capture | None = None, **options: Any) -> Plan:
+    return make_plan(of or capture(), load_config(overrides={"preshift": (0, 0), "window": 33, **options}))
+
+
+def refined(of: Capture | None = None, **options: Any) -> Refinement:
+    found = plan(of, **options).refine
+    assert found is not None
+    return found
+
+
+def test_default_is_refined_with_all_images_of_the_window() -> None:
+    found = refined()
+    assert (found.steps, found.size, found.thin, found.across) == (3, 33, 1, 33)
+    assert found.sigma == pytest.approx(33 * 19 / 65)
+    assert found.frames == tuple(range(-4, 5))
+    assert found.cameras == tuple((x, 0) for x in range(-4, 5))
+    assert (found.motion, found.modes, found.terms, found.unknowns) == (9, 1, 0, 13)
+    # Half the window; four camera steps, two pixels for each of four frames, four besides; the spline and its filter.
+    assert found.reach == 4 + 2 * 4 + 4
+    assert found.halo == 16 + found.reach + 2 + FILTER_RADIUS
+
+
+def test_cameras_stand_in_the_order_of_the_block() -> None:
+    planned = plan(capture(rows=3, cols=5, frames=7))
+    assert planned.refine is not None
+    rows, cols = planned.cameras
+    assert planned.refine.cameras == tuple((x - 2, y - 1) for y in rows for x in cols)
+    # The 4D model reads the line of cameras through the reference.
+    assert refined(capture(rows=3, cols=5), model="affine-4d", refine=3).cameras == tuple((x, 0) for x in range(-2, 3))
+
+
+def test_a_window_of_its_own_keeps_the_shape() -> None:
+    found = refined(window=33, sigma=8.0, refine_window=65, thin=4)
+    assert (found.size, found.sigma, found.across) == (65, pytest.approx(8.0 * 65 / 33), 17)
+
+
+@pytest.mark.parametrize(
+    ("options", "motion", "modes"),
+    [
+        ({"motion": "translation"}, 3, 1),
+        ({"motion": "rotation"}, 9, 1),
+        ({"motion": "acceleration", "deformation": "none"}, 9, 0),
+        ({"deformation": "strain"}, 9, 3),
+        ({"deformation": "growth", "model": "affine-4d"}, 9, 1),
+        ({"deformation": "growth", "model": "scene-flow"}, 9, 1),
+        ({"model": "scene-flow"}, 9, 1),
+        ({"model": "affine-translation", "motion": "auto"}, 9, 1),
+        ({"model": "range-flow", "motion": "auto"}, 9, 1),
+    ],
+)
+def test_unknowns_and_maps(options: dict[str, Any], motion: int, modes: int) -> None:
+    planned = plan(**{"refine": 2, **options})
+    assert planned.refine is not None
+    assert (planned.refine.motion, planned.refine.modes) == (motion, modes)
+    assert planned.refine.unknowns == 3 + motion + modes
+    names = planned.quantities
+    assert len(set(names)) == len(names)
+    assert {"disparity", *planned.refine.names} <= set(names)
+    assert ("rotation_z" in names, "acceleration_z" in names) == (motion >= 6, motion == 9)
+    assert ("growth_rate" in names, "strain_rate_12" in names) == (modes > 0, modes == 3)
+    assert (planned.margin, planned.differences) == (1, False)
+
+
+def test_static_scenes_have_no_motion() -> None:
+    for still in (capture(frames=1, cols=5), capture(cols=5)):
+        found = plan(still, model="depth", refine=3)
+        assert found.refine is not None
+        assert (found.refine.frames, found.refine.unknowns) == ((0,), 3)
+        assert found.quantities == ("disparity", "depth", "slope_x", "slope_y")
+
+
+@pytest.mark.parametrize(
+    ("brightness", "terms", "photometric"),
+    [
+        ("none", "none", 0), ("temporal", "none", 1), ("temporal", "space", 6), ("spatial", "none", 3),
+        ("spatial", "time", 3), ("spatial", "space", 6), ("spatial", "both", 6), ("camera", "none", 6),
+    ],
+)  # fmt: skip
+def test_photometric_terms_follow_the_brightness(brightness: str, terms: str, photometric: int) -> None:
+    assert refined(brightness=brightness, brightness_terms=terms).terms == photometric
+
+
+@pytest.mark.parametrize("model", ["affine-scene-flow", "affine-4d", "scene-flow"])
+def test_without_refinement_the_plan_is_that_of_the_model(model: str) -> None:
+    found = plan(model=model, refine=0)
+    assert found.refine is None
+    assert "growth_rate" in found.quantities
+    assert "acceleration_x" not in found.quantities
+    assert (found.margin, found.differences) == (1, True)
+    assert "refinement" not in found.describe()
+
+
+def test_the_plan_says_what_was_decided() -> None:
+    text = plan(window=65, deformation="strain").describe()
+    assert "refinement  at most 3 steps, window of 65 px thinned by 3 (441 samples), 9 frames of 9 cameras" in text
+    assert "15 unknowns" in text
+    assert "stride 4:" in text
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "message"),
+    [
+        ({}, {"model": "flow-affine", "refine": 3}, "refine.steps = 3: model 'flow-affine' reads one camera"),
+        ({"cols": 1}, {"refine": 2}, "refine.steps = 2: model 'flow-affine' reads one camera.*--refine 0"),
+        ({}, {"deformation": "strain", "refine": 0}, "'strain' is measured by the refinement alone: give --refine 3"),
+        ({}, {"deformation": "strain", "preset": "fast"}, "'strain' is measured by the refinement alone"),
+        ({}, {"deformation": "growth", "refine": 0, "model": "affine-4d"}, "choose affine-scene-flow, or a refinement"),
+        ({}, {"deformation": "growth", "refine": 0, "model": "scene-flow"}, "rows that begin with 2d"),
+        ({"frames": 1}, {"deformation": "strain", "refine": 3}, "model 'depth' is static: choose deformation none"),
+        ({}, {"refine_window": 97}, "refine.window = 97: the images have 128 x 96 pixels.*at most 95"),
+        ({"size": (97, 99)}, {"refine_window": 99}, "the images have 99 x 97 pixels.*at most 97"),
+        ({}, {"thin": 5}, "refine.thin = 5 leaves 7 samples across a window of 33 px, 9 are needed: choose --thin 4"),
+    ],
+)
+def test_refusals_name_value_limit_and_way_out(of: dict[str, Any], options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        plan(capture(**of), **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_largest_thinning_is_allowed() -> None:
+    assert refined(thin=4).across == 9
+    assert refined(window=65, thin=8).across == 9
+
+
+def test_memory_holds_the_coefficients_and_the_wider_block() -> None:
+    """One band of 40 x 24 pixels, a pixel more around it; 9 frames of 9 cameras in single precision."""
+    options = {"model": "affine-4d", "stride": 1, "roi": (30, 30, 70, 54), "tile": 24, "arrays": "depth"}
+    without, found = plan(**options, refine=0), plan(**options, refine=3)
+    assert found.refine is not None
+    halo = found.refine.halo
+    rows, cols = 24 + 2 + 2 * halo, 40 + 2 + 2 * halo
+    pitch = 64 * math.ceil(cols / 64)
+    own = without.problem.sampling.x.radius + without.problem.sampling.x.filter_radius
+    wider = rows * cols - (24 + 2 + 2 * own) * (40 + 2 + 2 * own)
+    assert found.bytes - without.bytes == 9 * 9 * rows * pitch * 4 + len(without.cameras[1]) * wider * 5
