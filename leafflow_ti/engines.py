@@ -15,6 +15,7 @@ from leafflow_ti.range_engine import RangeEngine, Sample
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import EstimateStage, View
 from leafflow_ti.stages.prefilter import Prefilter
+from leafflow_ti.stages.refine import RefineStage
 from leafflow_ti.stages.tensor import Band, TensorStage
 
 KEPT_BYTES = 512 << 20
@@ -25,7 +26,7 @@ KEPT_BYTES = 512 << 20
 class Engine:
     """The stages for bands of one size: prefilter, tensors of the reference model and of the own flows, estimate.
 
-    ``key``: what they depend on.
+    ``key``: what they depend on. ``widening``: pixels that the refinement needs around the block of the tensors.
     """
 
     key: tuple[Any, ...]
@@ -33,12 +34,17 @@ class Engine:
     tensor: TensorStage
     estimate: EstimateStage
     ranges: RangeEngine | None = None
+    refine: RefineStage | None = None
+    widening: int = 0
 
     @classmethod
     def of(cls, device: Device, plan: Plan, band: Band, view: Callable[[int], View], apart: bool) -> Engine:
         """The kept stages if they are the ones, else new ones. ``view``: of an output of a given pitch."""
         problem, filters = plan.problem, plan.config.filters
-        key = (device, problem, plan.layout, band, bool(plan.margin), filters.prefilter, filters.sigma_pre, apart)
+        key = (
+            device, problem, plan.layout, band, plan.differences, filters.prefilter, filters.sigma_pre, apart,
+            plan.refine, (plan.geometry, plan.preshift) if plan.refine else None,
+        )  # fmt: skip
         kept = _take(key)
         if kept is not None and not plan.ranges:
             return kept
@@ -47,15 +53,21 @@ class Engine:
         first = view(tensor.out_pitch)
         ranges = RangeEngine(device, plan.ranges, problem.sampling, first, band) if plan.ranges else None
         read = ranges.outer if ranges else band
+        # The refinement sees the same block as the tensors, on every side this much wider.
+        widening = max(0, plan.refine.halo - min(band.halo_y, band.halo_x)) if plan.refine else 0
+        rows, cols = read.in_rows + 2 * widening, read.in_cols + 2 * widening
+        refine = RefineStage(device, plan.refine, first, rows, cols) if plan.refine else None
         prefilter = None
         if filters.prefilter != "none":
-            prefilter = Prefilter(device, filters.prefilter, filters.sigma_pre, read.in_rows, read.in_cols)
-        estimate = EstimateStage(device, problem, plan.layout, first, bool(plan.margin), apart)
-        return cls(key, prefilter, tensor, estimate, ranges)
+            prefilter = Prefilter(device, filters.prefilter, filters.sigma_pre, rows, cols)
+        estimate = EstimateStage(device, problem, plan.layout, first, plan.differences, apart)
+        return cls(key, prefilter, tensor, estimate, ranges, refine, widening)
 
     def reset(self) -> None:
         """Forget all frames."""
         self.tensor.reset()
+        if self.refine:
+            self.refine.reset()
 
     def push(self, sample: Sample) -> Any | None:
         """Add a frame of every camera; the tensors once the windows are full."""

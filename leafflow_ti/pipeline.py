@@ -21,6 +21,7 @@ from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
 from leafflow_ti.reading import Box, Reader
+from leafflow_ti.refinement import PARAMETERS, Place, refine_maps
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import View
 from leafflow_ti.stages.prefilter import Prefilter
@@ -34,12 +35,15 @@ _NO_IMAGES: NDArray[Any] = np.empty((0, 0, 0, 0), np.float32)
 
 @dataclass(frozen=True)
 class _Stay:
-    """An engine over one band. ``box``: block of images that it needs, with the prefilter's margin; ``allowed``
-    [rows, cols] of the block without it: pixels that may count; ``place``: of the computed rectangle among the rows
-    around the band; ``centre``: the block's pixels at the output positions."""
+    """An engine over one band. ``box``: block of images that it needs, with the prefilter's margin; ``wide``: without
+    it, as the refinement takes it; ``inner``: its part that the tensors take; ``allowed`` [rows, cols] of that: pixels
+    that may count; ``place``: of the computed rectangle among the rows around the band; ``centre``: pixels of the inner
+    block at the output positions."""
 
     engine: Engine
     box: Box
+    wide: Box
+    inner: tuple[slice, slice]
     allowed: NDArray[np.bool_]
     place: tuple[slice, slice]
     centre: tuple[slice, slice]
@@ -62,8 +66,9 @@ class Pipeline:
         self._y, self._x = (_widened(r, n, plan.margin) for r, n in ((plan.y, capture.height), (plan.x, capture.width)))
         self._rows = self._measurable("y", self._y, capture.height, 1)
         self._cols = self._measurable("x", self._x, capture.width, 0)
-        inputs = INPUTS if plan.margin else ()
+        inputs = (*(INPUTS if plan.differences else ()), *(PARAMETERS if plan.refine else ()))
         self._names = tuple(dict.fromkeys((*(n for n in plan.names if not n.startswith("growth")), *inputs)))
+        self._measured = {*plan.measured, *(INPUTS if plan.differences else ())}
 
     def warm_up(self) -> float:
         """Compile every kernel of the plan on a tiny band; the seconds that it took."""
@@ -169,7 +174,7 @@ class Pipeline:
         with contextlib.closing(self._reader.blocks(frames, stay.box)) as blocks:
             for t in frames:
                 with span("host", f"frame {t}"):
-                    sample = self._sample(stay, t, *next(blocks))
+                    sample = self._sample(stay, t, *self._prepared(stay, t, *next(blocks)))
                     tensors = engine.push(sample)
                     waiting.append(replace(sample, block=_NO_IMAGES))  # its images may go
                     del sample
@@ -177,7 +182,7 @@ class Pipeline:
                         continue
                     self.device.synchronize()
                     maps, status = self._maps(engine.estimate(tensors), waiting[0], stay.centre)
-                    result = self._frame_of(index, maps, status, stay.place)
+                    result = self._frame_of(index, maps, status, stay)
                 yield plan.unit(first + t - latency - plan.frames[first], index), *result
 
     def _move(self, index: int) -> _Stay:
@@ -196,9 +201,13 @@ class Pipeline:
         if engine.ranges:
             band, corner = engine.ranges.outer, engine.ranges.move(engine.estimate.view, corner)
         inner = Box(*corner, band.in_rows, band.in_cols)
+        wide = inner.widened(engine.widening)
+        if engine.refine:
+            engine.refine.set_mask(self._reader.masked(wide))
         margin = engine.prefilter.radius if engine.prefilter else 0
         place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
-        return _Stay(engine, inner.widened(margin), self._reader.inside(inner), place, centre)
+        within = slice(engine.widening, engine.widening + inner.rows), slice(engine.widening, engine.widening + inner.cols)
+        return _Stay(engine, wide.widened(margin), wide, within, self._reader.inside(inner), place, centre)
 
     def read_alone(self, index: int, frames: range) -> dict[str, float]:
         """Seconds of reading and of decoding a band's images of these frames while nothing else goes on."""
@@ -220,9 +229,9 @@ class Pipeline:
         return slice(max(0, rows.start + first - margin), min(len(self._y), rows.stop + first + margin))
 
     def _frame_of(
-        self, band: int, maps: Maps, status: NDArray[np.uint8] | None, place: tuple[slice, slice] | None
+        self, band: int, maps: Maps, status: NDArray[np.uint8] | None, stay: _Stay | None
     ) -> tuple[Maps, NDArray[np.uint8]]:
-        """The unit's maps with the measured rectangle at ``place`` within the rows around it; border around that,
+        """The unit's maps with the measured rectangle at its place within the rows around it; border around that,
         masked where the mask says."""
         plan = self.plan
         whole = self._around(plan.band(band))
@@ -230,28 +239,48 @@ class Pipeline:
         shape = (len(y), len(x))
         codes = np.full(shape, Status.BORDER, np.uint8)
         framed = {name: np.full(shape, np.nan, np.float32) for name in self._names}
-        if place is not None and status is not None:
-            codes[place] = status
+        if stay is not None and status is not None:
+            codes[stay.place] = status
         if self._reader.mask is not None:
             codes[~self._reader.mask[np.ix_(y, x)]] = Status.MASKED
-        if place is not None:
-            empty = ~np.isin(codes[place], HAS_VALUE)
+        if stay is not None:
+            empty = ~np.isin(codes[stay.place], HAS_VALUE)
             for name, values in maps.items():
                 values[empty] = np.nan
-                framed[name][place] = values
-        if plan.margin:
+                framed[name][stay.place] = values
+        if plan.differences:
             geometry, sampling = plan.geometry, plan.problem.sampling
             growth = growth_maps(framed, y, x, geometry.f_px, geometry.principal_px, sampling)
             framed.update({name: values.astype(np.float32) for name, values in growth.items()})
+        if stay is not None and stay.engine.refine and plan.refine:
+            place = Place(y, x, (stay.wide.y, stay.wide.x), plan.geometry)
+            refine_maps(stay.engine.refine, plan.refine, framed, codes, place)
         unit = plan.y[plan.band(band)]
         inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
         return {n: framed[n][inner].copy() for n in plan.names}, codes[inner].copy()
 
-    def _sample(self, stay: _Stay, t: int, block: NDArray[Any], finite: NDArray[np.bool_]) -> Sample:
-        """What the tensor stages take: one frame's images [sy, sx, rows, cols] of a stay, prefiltered."""
-        engine, allowed = stay.engine, stay.allowed
+    def _prepared(
+        self, stay: _Stay, t: int, block: NDArray[Any], finite: NDArray[np.bool_]
+    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """One frame's images and where they are finite, prefiltered, as the tensors take them; the refinement takes
+        its wider ones."""
+        engine = stay.engine
         if engine.prefilter:
             block, finite = self._prefiltered(engine.prefilter, t, block, finite, stay.box)
+        if not engine.refine:
+            return block, finite
+        engine.refine.push(block, finite & self._seen(stay.wide))
+        within = (..., *stay.inner)
+        return np.ascontiguousarray(block[within]), finite[within]
+
+    def _seen(self, box: Box) -> NDArray[np.bool_]:
+        """Where the pixels of a block lie inside the images of each camera, [sy, sx, rows, cols]."""
+        in_y, in_x = self._reader.seen(box.y + np.arange(box.rows), box.x + np.arange(box.cols))
+        return in_y[:, None, :, None] & in_x[None, :, None, :]
+
+    def _sample(self, stay: _Stay, t: int, block: NDArray[Any], finite: NDArray[np.bool_]) -> Sample:
+        """What the tensor stages take: one frame's images [sy, sx, rows, cols] of a stay."""
+        engine, allowed = stay.engine, stay.allowed
         everywhere = np.asarray(finite.all(axis=(0, 1)))
         if engine.ranges:
             return engine.ranges.sample(t, block, allowed & everywhere, everywhere)
@@ -263,8 +292,7 @@ class Pipeline:
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """The block without the prefilter's margin, and where it is finite."""
         with span("prefilter"):
-            in_y, in_x = self._reader.seen(box.y + np.arange(box.rows), box.x + np.arange(box.cols))
-            valid = finite & in_y[:, None, :, None] & in_x[None, :, None, :]
+            valid = finite & self._seen(box)
             if self.plan.config.filters.prefilter == "homomorphic":
                 self._reader.require_positive(block, valid, t, box)
             stack, r = (-1, box.rows, box.cols), prefilter.radius
@@ -283,6 +311,8 @@ class Pipeline:
         maps = {}
         for name in self._names:
             base = name.removesuffix("_std")
+            if base not in self._measured:
+                continue
             if name in sample.maps:
                 maps[name] = sample.maps[name][centre].astype(np.float32)
             else:

@@ -13,7 +13,7 @@ from leafflow_ti.bands import READ_AHEAD, Demand, choose_bands, usable_memory
 from leafflow_ti.capture import DEFAULT_CACHE_BYTES, ArrayCapture, Capture, Geometry, find_preshift
 from leafflow_ti.config import RunConfig, resolve
 from leafflow_ti.errors import ConfigError
-from leafflow_ti.field import MOTION_NAMES
+from leafflow_ti.field import MOTION_NAMES, QUANTITIES
 from leafflow_ti.model_plan import cameras_read, check_model, fitted_motion, model_problem, sampling_of, static
 from leafflow_ti.models import MODELS, TensorLayout
 from leafflow_ti.range_plan import RangePlan, range_problem
@@ -87,7 +87,15 @@ class Plan:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Names of the measured maps."""
+        """Names of the maps: those that the model measures, and those that the refinement adds."""
+        if self.refine is None:
+            return self.measured
+        names = {*self.measured, *self.refine.names}
+        return tuple(n for n in QUANTITIES if n in names and (self.refine.modes or n != "growth_rate"))
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the maps that the model itself measures."""
         problem = self.problem
         names: list[str] = []
         if problem.terms:
@@ -95,27 +103,21 @@ class Plan:
         if "x" in problem.terms:
             names += ["slope_x", "slope_y"]
         names += self.ranges.quantities if self.ranges else ()
-        names += self.refine.names if self.refine else MOTION_NAMES[: problem.unknowns]
+        names += MOTION_NAMES[: problem.unknowns]
         if "t" in problem.columns.solutions and not self.ranges:
             names += ["flow_x", "flow_y"]
         if problem.columns.index("i") is not None:
             names += [f"brightness_{a}" for a in problem.camera_axes]
         names += [BRIGHTNESS_MAPS[o] for o in problem.brightness]
         names += [WORLD_MAPS[o] for o in problem.world_brightness]
-        if self._grows_by_differences:
+        if "depth" in names and problem.unknowns >= 3:
             names.append("growth_rate")
-        return tuple(dict.fromkeys(names))
-
-    @property
-    def _grows_by_differences(self) -> bool:
-        """Whether growth is told from the velocities of neighbours; a refinement has it among its unknowns."""
-        measured = bool(self.problem.terms or self.ranges)
-        return measured and self.problem.unknowns >= 3 and self.refine is None
+        return tuple(names)
 
     @property
     def differences(self) -> bool:
-        """Whether differences between neighbouring output pixels are needed."""
-        return self._grows_by_differences and any(name.startswith("growth") for name in self.names)
+        """Whether growth is told from differences between the velocities of neighbouring output pixels."""
+        return "growth_rate" in self.measured and any(name.startswith("growth") for name in self.names)
 
     @property
     def margin(self) -> int:

@@ -83,14 +83,18 @@ class Reader:
 
     def inside(self, box: Box) -> Mask:
         """Where every camera sees its image and the mask allows a measurement: [rows, cols]."""
-        capture = self.capture
         y, x = box.y + np.arange(box.rows), box.x + np.arange(box.cols)
         in_y, in_x = (np.logical_and.reduce(seen) for seen in self.seen(y, x))
         inside = in_y[:, None] & in_x
+        kept = self.masked(box)
+        return np.asarray(inside if kept is None else inside & kept)
+
+    def masked(self, box: Box) -> Mask | None:
+        """Where the mask allows a measurement: [rows, cols], continued beyond the image; None without a mask."""
         if self.mask is None:
-            return np.asarray(inside)
-        kept = self.mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
-        return np.asarray(inside & kept)
+            return None
+        capture, y, x = self.capture, box.y + np.arange(box.rows), box.x + np.arange(box.cols)
+        return self.mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
 
     def require_positive(self, block: NDArray[Any], valid: Mask, t: int, box: Box) -> None:
         """Raise InputError for the first valid grey value of a block that has no logarithm."""

@@ -1,59 +1,23 @@
-"""The plan of the exact refinement: which samples of which images, which unknowns; and the filter of the images.
+"""The plan of the exact refinement: which samples of which images, which unknowns.
 
 A pure value; stages and kernels read it.
 """
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
 from leafflow_ti.presets import REFINED_WINDOW
+from leafflow_ti.splines import FILTER_RADIUS, SUPPORT
 
-Array = NDArray[np.float64]
-
-PREFILTER_SIGMA = 0.85
-"""Gaussian of the images [px]: below, interpolation errs; above, texture is lost."""
 PIXEL_VARIANCE = 1 / 12
 """Variance of a pixel's area [px²], over which the sensor has averaged already."""
-SUPPORT = 2
-"""Reach of a cubic B-spline [px]."""
-LEAST_TAP = 1e-7
-"""Taps below this share of the largest are left out: the rounding of single precision."""
-
 _TERMS = {"none": 0, "temporal": 1, "spatial": 3, "camera": 6}
 """Brightness model -> photometric terms of an image: gain; its slopes; its curvatures."""
-
-
-@functools.cache
-def filter_taps() -> Array:
-    """Symmetric kernel from grey values to cubic B-spline coefficients of the smoothed image, float64 [2 radius + 1].
-
-    A Gaussian of ``PREFILTER_SIGMA`` and the inverse of the sampled spline (1/6, 4/6, 1/6), which is ``√3 z^|k|`` with
-    ``z = √3 - 2``, along one axis; the sum is 1.
-    """
-    offset = np.arange(-64, 65)
-    gaussian = np.exp(-0.5 * (offset / PREFILTER_SIGMA) ** 2)
-    inverse = math.sqrt(3) * (math.sqrt(3) - 2) ** np.abs(offset)
-    taps = np.convolve(gaussian, inverse, "same")
-    taps = (taps + taps[::-1]) / 2  # symmetric to the last bit
-    radius = int(np.abs(offset[np.abs(taps) >= LEAST_TAP * taps.max()]).max())
-    taps = taps[64 - radius : 64 + radius + 1]
-    taps = np.asarray(taps / taps.sum())
-    taps.flags.writeable = False  # shared by all who ask
-    return taps
-
-
-FILTER_RADIUS = len(filter_taps()) // 2
-"""Pixels that a coefficient needs on each side."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,347 @@
+"""The samples of a window: warped images, the texture that is in all of them, and sums of residuals.
+
+    V_k(δ) = g_k(δ) (T(δ) + blur_k · (Txx, Txy, Tyy))        g_k = 1 + Σ a_k,m φ_m(δ)
+
+Images are interpolated by quintic B-splines. What smooths an image (the area of a pixel, the prefilter) is isotropic there,
+so images in which the surface looks narrower show it smoother along that direction: to first order by the second
+derivatives of the texture, with weights that follow from the warps (``Warp.BLUR``).
+"""
+
+import functools
+from types import SimpleNamespace
+
+from leafflow_ti.kernels.engine import lane_type, ti
+from leafflow_ti.kernels.refine_tables import DERIVATIVES, FUNCTIONS, NOTHING, SHIFTS, Scalar, Size, Value, Warp
+from leafflow_ti.kernels.refine_warp import warp_functions
+from leafflow_ti.kernels.spec import KernelSpec
+
+
+@functools.cache
+def sample_functions(spec: KernelSpec) -> SimpleNamespace:
+    """Stages on the samples of a window; ``S`` is their workspace in vectors, ``r`` the same in numbers."""
+    real, precise, lanes = spec.real, spec.precise, spec.lanes
+    V = lane_type(real, lanes)
+    scalars = warp_functions(spec).scalars
+
+    @ti.func
+    def total(v: ti.template()):
+        """Sum over the lanes."""
+        if ti.static(lanes > 1):
+            return v.sum()
+        return v
+
+    @ti.func
+    def gain(at: ti.i32, terms: ti.i32, x: ti.template(), y: ti.template(), r: ti.template()):
+        """g_k at the window points (x, y), in halves of the window."""
+        g = V(1.0)
+        if terms > 0:
+            g = g + r[at + Warp.GAIN]
+        if terms > 1:
+            g = g + r[at + Warp.GAIN + 1] * x + r[at + Warp.GAIN + 2] * y
+        if terms > 3:
+            g = g + (r[at + Warp.GAIN + 3] * x + r[at + Warp.GAIN + 4] * y) * x + r[at + Warp.GAIN + 5] * y * y
+        return g
+
+    @ti.func
+    def weight_of(seen: ti.template(), expected: ti.template(), limit: real):
+        """1 where there is a value; less where it is far from ``expected``, 0 beyond the root of ``limit``: Tukey's."""
+        weight = ti.select(seen < V(0.1 * NOTHING), V(1.0), V(0.0))
+        if limit > 0.0:
+            off = ti.select(seen < V(0.1 * NOTHING), seen - expected, V(0.0))
+            near = ti.max(1.0 - off * off / limit, V(0.0))
+            weight = weight * near * near
+        return weight
+
+    @ti.func
+    def window(
+        slot: ti.template(), group: ti.i32, centre: ti.i32, size: ti.template(), sample: ti.template(),
+        mask: ti.template(), S: ti.template(), r: ti.template(),
+    ):  # fmt: skip
+        """Weights of the samples; 0 where the mask is."""
+        groups = size[Size.SAMPLE_GROUPS]
+        w = sample[2 * groups + group]
+        if size[Size.MASKED] > 0:
+            x, y = sample[group], sample[groups + group]
+            if ti.static(lanes == 1):
+                w = w * mask[centre + ti.cast(y, ti.i32) * size[Size.PITCH] + ti.cast(x, ti.i32)]
+            else:
+                for i in ti.static(range(lanes)):
+                    at = centre + ti.cast(y[i], ti.i32) * size[Size.PITCH] + ti.cast(x[i], ti.i32)
+                    w[i] = w[i] * mask[at]
+        S[slot.real + size[Size.WEIGHT] + group] = w
+
+    @ti.func
+    def position(at: ti.i32, x: ti.template(), y: ti.template(), along: ti.i32, r: ti.template()):
+        """Where the homography at ``at`` puts the window points (x, y), from the block's centre, along x (0) or y (1)."""
+        depth = 1.0 / (r[at + 6] * x + r[at + 7] * y + 1.0)
+        return (r[at + 3 * along] * x + r[at + 3 * along + 1] * y + r[at + 3 * along + 2]) * depth
+
+    @ti.func
+    def spline(m: ti.i32, derivative: ti.i32, u: ti.template(), value: ti.template()):
+        """Weight of neighbour m of six for a point ``u`` behind the third one, or a derivative of the weight."""
+        at = Value.SPLINE + (6 * derivative + m) * 6
+        w = ti.cast(value[at + 5], real) * u + ti.cast(value[at + 4], real)
+        for k in ti.static(range(3, -1, -1)):
+            w = w * u + ti.cast(value[at + k], real)
+        return w
+
+    @ti.func
+    def warp(
+        slot: ti.template(), group: ti.i32, centre: ti.i32, size: ti.template(), value: ti.template(),
+        origin: ti.template(), sample: ti.template(), coef: ti.template(), S: ti.template(), r: ti.template(),
+    ):  # fmt: skip
+        """Value and derivatives, to the second, of every image at one vector of samples: quintic B-splines."""
+        groups, pitch = size[Size.SAMPLE_GROUPS], size[Size.PITCH]
+        farthest = ti.cast(value[Value.LIMIT], real)
+        x, y = sample[group], sample[groups + group]
+        for k in range(size[Size.IMAGES]):
+            at = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
+            ix, iy = position(at, x, y, 0, r), position(at, x, y, 1, r)
+            inside = ti.select(ti.max(ti.max(ix, 0.0 - ix), ti.max(iy, 0.0 - iy)) < V(farthest), V(1.0), V(0.0))
+            ix = ti.max(ti.min(ix, V(farthest)), V(0.0 - farthest))
+            iy = ti.max(ti.min(iy, V(farthest)), V(0.0 - farthest))
+            fx, fy = ti.floor(ix), ti.floor(iy)
+            u, v = ix - fx, iy - fy
+            corner = (fy - 2.0) * ti.cast(pitch, real) + (fx - 2.0)
+            a0, a1, a2 = spline(0, 0, u, value), spline(1, 0, u, value), spline(2, 0, u, value)
+            a3, a4, a5 = spline(3, 0, u, value), spline(4, 0, u, value), spline(5, 0, u, value)
+            d0, d1, d2 = spline(0, 1, u, value), spline(1, 1, u, value), spline(2, 1, u, value)
+            d3, d4, d5 = spline(3, 1, u, value), spline(4, 1, u, value), spline(5, 1, u, value)
+            e0, e1, e2 = spline(0, 2, u, value), spline(1, 2, u, value), spline(2, 2, u, value)
+            e3, e4, e5 = spline(3, 2, u, value), spline(4, 2, u, value), spline(5, 2, u, value)
+            val, gx, gy, gxx, gxy, gyy = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+            worst = V(0.0)
+            for row in range(6):
+                first = origin[k] + centre + row * pitch
+                c0, c1, c2, c3, c4, c5 = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+                if ti.static(lanes == 1):
+                    b = first + ti.cast(corner, ti.i32)
+                    c0, c1, c2, c3, c4, c5 = coef[b], coef[b + 1], coef[b + 2], coef[b + 3], coef[b + 4], coef[b + 5]
+                else:
+                    for i in ti.static(range(lanes)):
+                        b = first + ti.cast(corner[i], ti.i32)
+                        c0[i] = coef[b]
+                        c1[i] = coef[b + 1]
+                        c2[i] = coef[b + 2]
+                        c3[i] = coef[b + 3]
+                        c4[i] = coef[b + 4]
+                        c5[i] = coef[b + 5]
+                worst = ti.max(worst, ti.max(ti.max(ti.max(c0, c1), ti.max(c2, c3)), ti.max(c4, c5)))
+                along = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3 + a4 * c4 + a5 * c5
+                slope = d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3 + d4 * c4 + d5 * c5
+                bend = e0 * c0 + e1 * c1 + e2 * c2 + e3 * c3 + e4 * c4 + e5 * c5
+                b0, b1 = spline(row, 0, v, value), spline(row, 1, v, value)
+                val = val + b0 * along
+                gx = gx + b0 * slope
+                gxx = gxx + b0 * bend
+                gy = gy + b1 * along
+                gxy = gxy + b1 * slope
+                gyy = gyy + spline(row, 2, v, value) * along
+            seen = (worst < V(0.1 * NOTHING)) & (inside > V(0.5))
+            to = slot.real + size[Size.SEEN] + DERIVATIVES * k * groups + group
+            S[to] = ti.select(seen, val, V(NOTHING))
+            S[to + groups] = ti.select(seen, gx, V(0.0))
+            S[to + 2 * groups] = ti.select(seen, gy, V(0.0))
+            S[to + 3 * groups] = ti.select(seen, gxx, V(0.0))
+            S[to + 4 * groups] = ti.select(seen, gxy, V(0.0))
+            S[to + 5 * groups] = ti.select(seen, gyy, V(0.0))
+
+    @ti.func
+    def texture(
+        slot: ti.template(), group: ti.i32, size: ti.template(), value: ti.template(), sample: ti.template(),
+        S: ti.template(), r: ti.template(), p: ti.template(),
+    ):  # fmt: skip
+        """One vector of samples: values of all images where the warps are now, and the texture.
+
+        Since the images were sampled the warps have moved little: the second-order expansion there is exact enough.
+        Where they have just been sampled, the texture's derivatives and the functions of the window are made, too.
+        """
+        groups, terms = size[Size.SAMPLE_GROUPS], size[Size.TERMS]
+        s = scalars(slot, size)
+        limit = ti.cast(p[s + Scalar.ROBUST], real)
+        half = 1.0 / ti.cast(value[Value.HALF], real)
+        x, y = sample[group], sample[groups + group]
+        ux, uy = x * half, y * half
+        before = S[slot.real + size[Size.TEXTURE] + group]
+        blurred = slot.real + size[Size.BLUR] + group
+        bxx, bxy, byy = S[blurred], S[blurred + groups], S[blurred + 2 * groups]
+        mass, level = V(0.0), V(0.0)
+        mean_xx, mean_xy, mean_yy = V(0.0), V(0.0), V(0.0)
+        tx, ty, txx, txy, tyy = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+        fresh = p[s + Scalar.RESAMPLE] > 0.5
+        for k in range(size[Size.IMAGES]):
+            at = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
+            n = slot.real + size[Size.SEEN] + DERIVATIVES * k * groups + group
+            gx, gy, gxx, gxy, gyy = (
+                S[n + groups], S[n + 2 * groups], S[n + 3 * groups], S[n + 4 * groups], S[n + 5 * groups]
+            )  # fmt: skip
+            val = S[n]
+            if not fresh:
+                dx = position(at, x, y, 0, r) - position(at + Warp.SAMPLED, x, y, 0, r)
+                dy = position(at, x, y, 1, r) - position(at + Warp.SAMPLED, x, y, 1, r)
+                val = val + dx * (gx + 0.5 * (dx * gxx) + dy * gxy) + dy * (gy + 0.5 * (dy * gyy))
+            S[slot.real + size[Size.VALUES] + k * groups + group] = val
+            g = gain(at, terms, ux, uy, r)
+            blur = r[at + Warp.BLUR] * bxx + r[at + Warp.BLUR + 1] * bxy + r[at + Warp.BLUR + 2] * byy
+            weight = weight_of(val, g * (before + blur), limit) * r[at + Warp.TRUST] * g
+            level = level + weight * ti.select(val < V(0.1 * NOTHING), val, V(0.0))
+            both = weight * g
+            mass = mass + both
+            mean_xx = mean_xx + both * r[at + Warp.BLUR]
+            mean_xy = mean_xy + both * r[at + Warp.BLUR + 1]
+            mean_yy = mean_yy + both * r[at + Warp.BLUR + 2]
+            if fresh:
+                # Derivatives by δ, through ∂x/∂δ at the window's centre; weighted as values are.
+                xx, xy, yx, yy = r[at + Warp.D], r[at + Warp.D + 1], r[at + Warp.D + 2], r[at + Warp.D + 3]
+                tx = tx + weight * (xx * gx + yx * gy)
+                ty = ty + weight * (xy * gx + yy * gy)
+                txx = txx + weight * (xx * xx * gxx + 2.0 * xx * yx * gxy + yx * yx * gyy)
+                txy = txy + weight * (xx * xy * gxx + (xx * yy + xy * yx) * gxy + yx * yy * gyy)
+                tyy = tyy + weight * (xy * xy * gxx + 2.0 * xy * yy * gxy + yy * yy * gyy)
+        some = ti.select(mass > V(1e-6), V(1.0), V(0.0))
+        scale = some / ti.max(mass, V(1e-6))
+        old = slot.real + size[Size.SCRATCH] + group
+        S[old], S[old + groups], S[old + 2 * groups] = bxx, bxy, byy
+        to = slot.real + size[Size.FUNCTION] + group
+        if fresh:
+            tx, ty = tx * scale, ty * scale
+            bxx, bxy, byy = txx * scale, txy * scale, tyy * scale
+            S[blurred], S[blurred + groups], S[blurred + 2 * groups] = bxx, bxy, byy
+            e = x * tx + y * ty
+            S[to] = tx
+            S[to + groups] = ty
+            S[to + 2 * groups] = x * tx
+            S[to + 3 * groups] = y * tx
+            S[to + 4 * groups] = x * ty
+            S[to + 5 * groups] = y * ty
+            S[to + 6 * groups] = x * e
+            S[to + 7 * groups] = y * e
+        found = (level - mean_xx * bxx - mean_xy * bxy - mean_yy * byy) * scale
+        S[slot.real + size[Size.BEFORE] + group] = before
+        S[slot.real + size[Size.TEXTURE] + group] = found
+        to = to + SHIFTS * groups
+        S[to] = found
+        S[to + groups] = found * ux
+        S[to + 2 * groups] = found * uy
+        S[to + 3 * groups] = found * ux * ux
+        S[to + 4 * groups] = found * ux * uy
+        S[to + 5 * groups] = found * uy * uy
+
+    @ti.func
+    def sums(
+        slot: ti.template(), k: ti.i32, size: ti.template(), value: ti.template(), sample: ti.template(),
+        S: ti.template(), r: ti.template(), p: ti.template(),
+    ):  # fmt: skip
+        """Of one image: residual times functions of the window, squared residual, and weight of its samples."""
+        groups, terms = size[Size.SAMPLE_GROUPS], size[Size.TERMS]
+        limit = ti.cast(p[scalars(slot, size) + Scalar.ROBUST], real)
+        half = 1.0 / ti.cast(value[Value.HALF], real)
+        at = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
+        y0, y1, y2, y3, y4, y5, y6, y7 = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+        b0, b1, b2, b3, b4, b5, mass, energy = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+        for i in range(groups):
+            ux, uy = sample[i] * half, sample[groups + i] * half
+            g = gain(at, terms, ux, uy, r)
+            n = slot.real + size[Size.BLUR] + i
+            blur = r[at + Warp.BLUR] * S[n] + r[at + Warp.BLUR + 1] * S[n + groups]
+            blur = blur + r[at + Warp.BLUR + 2] * S[n + 2 * groups]
+            n = slot.real + size[Size.SCRATCH] + i
+            old = r[at + Warp.BLUR] * S[n] + r[at + Warp.BLUR + 1] * S[n + groups]
+            old = old + r[at + Warp.BLUR + 2] * S[n + 2 * groups]
+            seen = S[slot.real + size[Size.VALUES] + k * groups + i]
+            weight = weight_of(seen, g * (S[slot.real + size[Size.BEFORE] + i] + old), limit)
+            weight = weight * S[slot.real + size[Size.WEIGHT] + i]
+            off = seen - g * (S[slot.real + size[Size.TEXTURE] + i] + blur)
+            off = ti.select(weight > V(0.0), off, V(0.0))
+            mass = mass + weight
+            off_w = off * weight
+            energy = energy + off_w * off
+            n = slot.real + size[Size.FUNCTION] + i
+            scaled = off_w * g
+            y0 = y0 + scaled * S[n]
+            y1 = y1 + scaled * S[n + groups]
+            y2 = y2 + scaled * S[n + 2 * groups]
+            y3 = y3 + scaled * S[n + 3 * groups]
+            y4 = y4 + scaled * S[n + 4 * groups]
+            y5 = y5 + scaled * S[n + 5 * groups]
+            y6 = y6 + scaled * S[n + 6 * groups]
+            y7 = y7 + scaled * S[n + 7 * groups]
+            if terms > 0:
+                n = n + SHIFTS * groups
+                b0 = b0 + off_w * S[n]
+                b1 = b1 + off_w * S[n + groups]
+                b2 = b2 + off_w * S[n + 2 * groups]
+                b3 = b3 + off_w * S[n + 3 * groups]
+                b4 = b4 + off_w * S[n + 4 * groups]
+                b5 = b5 + off_w * S[n + 5 * groups]
+        step = size[Size.IMAGE_GROUPS] * lanes
+        to = (slot.precise + size[Size.SUMS]) * lanes + k
+        found = ti.static([y0, y1, y2, y3, y4, y5, y6, y7, b0, b1, b2, b3, b4, b5])
+        for n in ti.static(range(FUNCTIONS)):
+            p[to + n * step] = ti.cast(total(found[n]), precise)
+        p[(slot.precise + size[Size.MASS]) * lanes + k] = ti.cast(total(mass), precise)
+        p[(slot.precise + size[Size.ENERGY]) * lanes + k] = ti.cast(total(energy), precise)
+
+    @ti.func
+    def gram(slot: ti.template(), i: ti.i32, size: ti.template(), S: ti.template(), p: ti.template()):
+        """Row i of the sums of products of the functions of the window."""
+        s, groups = scalars(slot, size), size[Size.SAMPLE_GROUPS]
+        first = slot.real + size[Size.FUNCTION]
+        for j in range(i + 1):
+            found = V(0.0)
+            for n in range(groups):
+                found = found + S[first + i * groups + n] * S[first + j * groups + n] * S[
+                    slot.real + size[Size.WEIGHT] + n
+                ]
+            element = ti.cast(total(found), precise)
+            p[s + Scalar.GRAM + i * FUNCTIONS + j] = element
+            p[s + Scalar.GRAM + j * FUNCTIONS + i] = element
+
+    @ti.func
+    def spread_noise(
+        slot: ti.template(), b: ti.i32, size: ti.template(), value: ti.template(), r: ti.template(), p: ti.template()
+    ):
+        """A function without what photometric terms take of it, weighted; and what correlated noise makes of that.
+
+        Both are written to SCRATCH; the noise is correlated over neighbouring samples of the lattice.
+        """
+        s, n, across = scalars(slot, size), size[Size.SAMPLE_GROUPS] * lanes, size[Size.ACROSS]
+        first = (slot.real + size[Size.FUNCTION]) * lanes
+        plain = (slot.real + size[Size.SCRATCH]) * lanes + b * n
+        rough = (slot.real + size[Size.SCRATCH]) * lanes + (SHIFTS + b) * n
+        along_x = (slot.real + size[Size.FUNCTION]) * lanes + b * n
+        reach = size[Size.NEIGHBOURS]
+        for i in range(n):
+            found = r[first + b * n + i]
+            for m in range(size[Size.TERMS]):
+                taken = ti.cast(p[s + Scalar.SOLVED + m * SHIFTS + b], real)
+                found = found - taken * r[first + (SHIFTS + m) * n + i]
+            r[plain + i] = found * r[(slot.real + size[Size.WEIGHT]) * lanes + i]
+        # The function itself is no longer needed: its place takes the sums along x.
+        for y in range(across):
+            for x in range(across):
+                found = ti.cast(0.0, real)
+                for d in range(ti.max(0, x - reach), ti.min(across, x + reach + 1)):
+                    found += r[plain + y * across + d] * ti.cast(value[Value.CORRELATION_AT + ti.abs(d - x)], real)
+                r[along_x + y * across + x] = found
+        for y in range(across):
+            for x in range(across):
+                found = ti.cast(0.0, real)
+                for d in range(ti.max(0, y - reach), ti.min(across, y + reach + 1)):
+                    found += r[along_x + d * across + x] * ti.cast(value[Value.CORRELATION_AT + ti.abs(d - y)], real)
+                r[rough + y * across + x] = found
+
+    @ti.func
+    def noise(slot: ti.template(), i: ti.i32, size: ti.template(), r: ti.template(), p: ti.template()):
+        """Row i of the noise of the functions' sums, per variance of a sample."""
+        s, n = scalars(slot, size), size[Size.SAMPLE_GROUPS] * lanes
+        first = (slot.real + size[Size.SCRATCH]) * lanes
+        for j in range(SHIFTS):
+            found = ti.cast(0.0, precise)
+            for k in range(size[Size.SAMPLES]):
+                found += ti.cast(r[first + i * n + k] * r[first + (SHIFTS + j) * n + k], precise)
+            p[s + Scalar.NOISE + i * SHIFTS + j] = found
+
+    return SimpleNamespace(
+        window=window, warp=warp, texture=texture, sums=sums, gram=gram, spread_noise=spread_noise, noise=noise
+    )  # fmt: skip

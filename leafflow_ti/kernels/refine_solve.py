@@ -1,0 +1,456 @@
+"""Normal equations of a pixel from the sums of its images, the step, and the covariance at the end.
+
+With C_k [8, n] what the unknowns do to the functions B of the window, and the texture eliminated, the Jacobian of image k
+is ``g_k B^T (C_k - mean C)``; without what the photometric terms ``T φ`` explain,
+
+    H = Σ_k ω_k (C_k - mean C)^T (G - X M^-1 X^T) (C_k - mean C),   G = Σ w B B^T, X = Σ w B Tφ^T, M = Σ w Tφ Tφ^T
+
+where the weights ω_k of the images take the share of their samples that is valid, too.
+"""
+
+import functools
+from types import SimpleNamespace
+
+from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.refine_tables import (
+    FUNCTIONS,
+    MAX_UNKNOWNS,
+    SHIFTS,
+    TERMS,
+    Code,
+    Image,
+    Out,
+    Scalar,
+    Size,
+    Value,
+)
+from leafflow_ti.kernels.refine_warp import warp_functions
+from leafflow_ti.kernels.spec import KernelSpec
+
+LONGEST_STEP = 1.0
+"""Pixels that a step may move anything in the window of any image."""
+DRIFT = 0.15
+"""Pixels that the warps may move before the images are sampled anew."""
+OUTLYING = 16.0
+"""Mean squared residual of an image, against the typical one, beyond which it is trusted less."""
+TUKEY = 6.0
+"""Standard deviations beyond which a sample has no weight."""
+CONVERGED = 0.01
+"""Square of a step, in standard errors, that ends the iteration."""
+LAST_STEP = 1.0
+"""The same: how large the last of the allowed steps may be, unless it is much shorter than the first one."""
+CONTRACTED = 0.1
+UNDETERMINED = 1e-9
+"""Share of an unknown's column, squared, that the others must leave of it."""
+
+
+@functools.cache
+def solve_functions(spec: KernelSpec) -> SimpleNamespace:
+    """``begin``: a pixel's start. ``solve``: one step. ``finish``: covariance and results."""
+    precise, lanes, V = spec.precise, spec.lanes, spec.element
+    scalars = warp_functions(spec).scalars
+    not_converged, singular, empty, worse = (
+        float(c) for c in (Code.NOT_CONVERGED, Code.SINGULAR, Code.EMPTY, Code.WORSE)
+    )
+
+    @ti.func
+    def total(v: ti.template()):
+        """Sum over the lanes."""
+        if ti.static(lanes > 1):
+            return v.sum()
+        return v
+
+    @ti.func
+    def largest(v: ti.template()):
+        """Maximum over the lanes."""
+        if ti.static(lanes > 1):
+            return v.max()
+        return v
+
+    @ti.func
+    def cholesky(a: ti.i32, n: ti.i32, least: precise, fixed: ti.i32, p: ti.template()):
+        """Factor the lower triangle [n, n] of numbers at ``a`` in place. A pivot below ``least`` times its diagonal
+        element takes its unknown out; it is marked at ``fixed``."""
+        for c in range(n):
+            diagonal = p[a + c * n + c]
+            pivot = diagonal
+            for k in range(c):
+                pivot -= p[a + c * n + k] * p[a + c * n + k]
+            good = pivot > least * diagonal
+            p[fixed + c] = ti.select(good, precise(0.0), precise(1.0))
+            root = ti.sqrt(ti.max(pivot, precise(1e-30)))
+            for r in range(c + 1, n):
+                element = p[a + r * n + c]
+                for k in range(c):
+                    element -= p[a + r * n + k] * p[a + c * n + k]
+                p[a + r * n + c] = ti.select(good, element / root, precise(0.0))
+            p[a + c * n + c] = ti.select(good, root, precise(1.0))
+            if not good:
+                for k in range(c):
+                    p[a + c * n + k] = precise(0.0)
+
+    @ti.func
+    def substitute(a: ti.i32, n: ti.i32, x: ti.i32, step: ti.i32, p: ti.template()):
+        """Solve with a factor in place: right-hand side and solution at ``x``, ``step`` apart."""
+        for r in range(n):
+            element = p[x + r * step]
+            for k in range(r):
+                element -= p[a + r * n + k] * p[x + k * step]
+            p[x + r * step] = element / p[a + r * n + r]
+        for m in range(n):
+            r = n - 1 - m
+            element = p[x + r * step]
+            for k in range(r + 1, n):
+                element -= p[a + k * n + r] * p[x + k * step]
+            p[x + r * step] = element / p[a + r * n + r]
+
+    @ti.func
+    def begin(
+        slot: ti.template(), pixel: ti.i32, size: ti.template(), image: ti.template(), start: ti.template(),
+        P: ti.template(), p: ti.template(),
+    ):  # fmt: skip
+        """The start of a pixel: position and parameters; all images trusted, no change of brightness."""
+        s, groups = scalars(slot, size), size[Size.IMAGE_GROUPS]
+        at = pixel * (MAX_UNKNOWNS + 2)
+        p[s + Scalar.X0], p[s + Scalar.Y0] = start[at], start[at + 1]
+        for i in range(MAX_UNKNOWNS):
+            p[s + Scalar.Q + i] = start[at + 2 + i]
+            p[s + Scalar.ACCEPTED + i] = start[at + 2 + i]
+        for i in range(Scalar.COST, Scalar.ROBUST + 1):
+            p[s + i] = precise(0.0)
+        p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
+        for g in range(groups):
+            P[slot.precise + size[Size.TRUST] + g] = image[Image.PRESENT * groups + g]
+            for m in range(TERMS):
+                P[slot.precise + size[Size.GAIN] + m * groups + g] = V(0.0)
+                P[slot.precise + size[Size.GAIN_STEP] + m * groups + g] = V(0.0)
+
+    @ti.func
+    def weigh(slot: ti.template(), size: ti.template(), image: ti.template(), P: ti.template(), p: ti.template()):
+        """Cost of the pass, and the weights of the images from their residuals, against the harmonic mean of these."""
+        s, groups = scalars(slot, size), size[Size.IMAGE_GROUPS]
+        energy, mass, inverse, counted = precise(0.0), precise(0.0), precise(0.0), precise(0.0)
+        whole = p[s + Scalar.MASS]
+        for g in range(groups):
+            e, m = P[slot.precise + size[Size.ENERGY] + g], P[slot.precise + size[Size.MASS] + g]
+            trust = P[slot.precise + size[Size.TRUST] + g]
+            energy += total(e * trust)
+            mass += total(m * trust)
+            some = ti.select(m > V(0.1 * whole), V(1.0), V(0.0))
+            inverse += total(some * m / ti.max(e, V(1e-30)))
+            counted += total(some)
+        p[s + Scalar.COST] = energy / ti.max(mass, precise(1e-30))
+        p[s + Scalar.IMAGES] = mass / ti.max(whole, precise(1e-30))
+        typical = counted / ti.max(inverse, precise(1e-30))
+        for g in range(groups):
+            e, m = P[slot.precise + size[Size.ENERGY] + g], P[slot.precise + size[Size.MASS] + g]
+            bound = V(OUTLYING * typical) * m / ti.max(e, V(1e-30))
+            share = ti.min(bound, V(1.0))
+            P[slot.precise + size[Size.TRUST] + g] = image[Image.PRESENT * groups + g] * share * share
+
+    @ti.func
+    def photometry(slot: ti.template(), size: ti.template(), p: ti.template()):
+        """Factor of M, ``M^-1 X^T``, and the metric ``G - X M^-1 X^T``."""
+        s, terms = scalars(slot, size), size[Size.TERMS]
+        gram = s + Scalar.GRAM
+        for i in range(terms):
+            for j in range(terms):
+                p[s + Scalar.TERMS + i * terms + j] = p[gram + (SHIFTS + i) * FUNCTIONS + SHIFTS + j]
+        cholesky(s + Scalar.TERMS, terms, precise(1e-12), s + Scalar.FIXED, p)
+        for b in range(SHIFTS):
+            for m in range(terms):
+                p[s + Scalar.SOLVED + m * SHIFTS + b] = p[gram + b * FUNCTIONS + SHIFTS + m]
+            substitute(s + Scalar.TERMS, terms, s + Scalar.SOLVED + b, SHIFTS, p)
+        for a in range(SHIFTS):
+            for b in range(SHIFTS):
+                element = p[gram + a * FUNCTIONS + b]
+                for m in range(terms):
+                    element -= p[gram + a * FUNCTIONS + SHIFTS + m] * p[s + Scalar.SOLVED + m * SHIFTS + b]
+                p[s + Scalar.METRIC + a * SHIFTS + b] = element
+
+    @ti.func
+    def weight_at(slot: ti.template(), g: ti.i32, size: ti.template(), P: ti.template(), whole: precise):
+        """Weights of a vector of images: trust times the share of their samples."""
+        return P[slot.precise + size[Size.TRUST] + g] * P[slot.precise + size[Size.MASS] + g] * (1.0 / whole)
+
+    @ti.func
+    def centre_moves(slot: ti.template(), size: ti.template(), P: ti.template(), p: ti.template()):
+        """Subtract from the moves their mean over the images: what is common to all is texture."""
+        s, n, groups = scalars(slot, size), size[Size.UNKNOWNS], size[Size.IMAGE_GROUPS]
+        whole = p[s + Scalar.MASS]
+        all_images = precise(0.0)
+        for g in range(groups):
+            all_images += total(weight_at(slot, g, size, P, whole))
+        for i in range(SHIFTS * n):
+            at = slot.precise + size[Size.MOVES] + i * groups
+            mean = V(0.0)
+            for g in range(groups):
+                mean = mean + P[at + g] * weight_at(slot, g, size, P, whole)
+            average = total(mean) / ti.max(all_images, precise(1e-30))
+            for g in range(groups):
+                P[at + g] = P[at + g] - average
+
+    @ti.func
+    def normal_equations(slot: ti.template(), metric: ti.i32, squared: ti.i32, size: ti.template(), P: ti.template(), p: ti.template()):
+        """Packed ``Σ ω C^T metric C`` into NORMAL; with ω² where ``squared``."""
+        s, n, groups = scalars(slot, size), size[Size.UNKNOWNS], size[Size.IMAGE_GROUPS]
+        whole = p[s + Scalar.MASS]
+        normal, product = slot.precise + size[Size.NORMAL], slot.precise + size[Size.PRODUCT]
+        for i in range(n * (n + 1) // 2):
+            P[normal + i] = V(0.0)
+        for g in range(groups):
+            weight = weight_at(slot, g, size, P, whole)
+            if squared > 0:
+                weight = weight * P[slot.precise + size[Size.TRUST] + g]
+            first = slot.precise + size[Size.MOVES] + g
+            for i in range(n):
+                for a in range(SHIFTS):
+                    element = V(0.0)
+                    for b in range(SHIFTS):
+                        element = element + P[first + (b * n + i) * groups] * p[metric + a * SHIFTS + b]
+                    P[product + a] = element * weight
+                for j in range(i + 1):
+                    element = P[normal + i * (i + 1) // 2 + j]
+                    for a in range(SHIFTS):
+                        element = element + P[first + (a * n + j) * groups] * P[product + a]
+                    P[normal + i * (i + 1) // 2 + j] = element
+
+    @ti.func
+    def right_side(slot: ti.template(), size: ti.template(), P: ti.template(), p: ti.template()):
+        """``Σ ω C^T (residual sums without the photometric terms')``."""
+        s, n, groups = scalars(slot, size), size[Size.UNKNOWNS], size[Size.IMAGE_GROUPS]
+        right, product = slot.precise + size[Size.RIGHT], slot.precise + size[Size.PRODUCT]
+        sums = slot.precise + size[Size.SUMS]
+        for i in range(n):
+            P[right + i] = V(0.0)
+        for g in range(groups):
+            trust = P[slot.precise + size[Size.TRUST] + g]
+            for b in range(SHIFTS):
+                element = P[sums + b * groups + g]
+                for m in range(size[Size.TERMS]):
+                    element = element - P[sums + (SHIFTS + m) * groups + g] * p[s + Scalar.SOLVED + m * SHIFTS + b]
+                P[product + b] = element * trust
+            for i in range(n):
+                element = P[right + i]
+                for b in range(SHIFTS):
+                    element = element + P[slot.precise + size[Size.MOVES] + (b * n + i) * groups + g] * P[product + b]
+                P[right + i] = element
+        for i in range(n):
+            p[s + Scalar.RIGHT + i] = total(P[right + i])
+
+    @ti.func
+    def scaled_factor(slot: ti.template(), size: ti.template(), P: ti.template(), p: ti.template()):
+        """Cholesky factor of the normal matrix, its columns scaled to a diagonal of 1."""
+        s, n = scalars(slot, size), size[Size.UNKNOWNS]
+        normal = slot.precise + size[Size.NORMAL]
+        for i in range(n):
+            diagonal = total(P[normal + i * (i + 1) // 2 + i])
+            p[s + Scalar.SCALE + i] = 1.0 / ti.sqrt(ti.max(diagonal, precise(1e-30)))
+        for i in range(n):
+            for j in range(i + 1):
+                element = total(P[normal + i * (i + 1) // 2 + j])
+                p[s + Scalar.NORMAL + i * n + j] = element * p[s + Scalar.SCALE + i] * p[s + Scalar.SCALE + j]
+        cholesky(s + Scalar.NORMAL, n, precise(UNDETERMINED), s + Scalar.FIXED, p)
+
+    @ti.func
+    def farthest(slot: ti.template(), size: ti.template(), value: ti.template(), P: ti.template(), p: ti.template()):
+        """How far the step moves anything in the window of any image, px."""
+        s, n, groups = scalars(slot, size), size[Size.UNKNOWNS], size[Size.IMAGE_GROUPS]
+        half = value[Value.HALF]
+        worst = V(0.0)
+        for g in range(groups):
+            square = V(0.0)
+            for b in range(6):
+                moved = V(0.0)
+                for i in range(n):
+                    at = slot.precise + size[Size.MOVES] + (b * n + i) * groups + g
+                    moved = moved + P[at] * p[s + Scalar.STEP + i]
+                weight = ti.select(b < 2, precise(1.0), 0.5 * half * half)
+                square = square + moved * moved * weight
+            worst = ti.max(worst, square * P[slot.precise + size[Size.TRUST] + g])
+        return ti.sqrt(largest(worst))
+
+    @ti.func
+    def change_gains(slot: ti.template(), factor: precise, size: ti.template(), P: ti.template(), p: ti.template()):
+        """The photometric terms' own step, given that of the unknowns."""
+        s, n, groups, terms = scalars(slot, size), size[Size.UNKNOWNS], size[Size.IMAGE_GROUPS], size[Size.TERMS]
+        whole = p[s + Scalar.MASS]
+        for g in range(groups):
+            share = P[slot.precise + size[Size.MASS] + g] * (1.0 / whole)
+            enough = ti.select(share > V(0.1), V(1.0), V(0.0)) / ti.max(share, V(0.1))
+            # M^-1 b by the factor, in place of b.
+            sums = slot.precise + size[Size.SUMS] + SHIFTS * groups + g
+            factor_at = s + Scalar.TERMS
+            for r in range(terms):
+                element = P[sums + r * groups]
+                for k in range(r):
+                    element = element - P[sums + k * groups] * p[factor_at + r * terms + k]
+                P[sums + r * groups] = element * (1.0 / p[factor_at + r * terms + r])
+            for m in range(terms):
+                r = terms - 1 - m
+                element = P[sums + r * groups]
+                for k in range(r + 1, terms):
+                    element = element - P[sums + k * groups] * p[factor_at + k * terms + r]
+                P[sums + r * groups] = element * (1.0 / p[factor_at + r * terms + r])
+            for m in range(terms):
+                change = P[sums + m * groups] * enough
+                for b in range(SHIFTS):
+                    moved = V(0.0)
+                    for i in range(n):
+                        at = slot.precise + size[Size.MOVES] + (b * n + i) * groups + g
+                        moved = moved + P[at] * p[s + Scalar.STEP + i]
+                    change = change + moved * p[s + Scalar.SOLVED + m * SHIFTS + b]
+                at = slot.precise + size[Size.GAIN_STEP] + m * groups + g
+                P[at] = change * factor
+                at = slot.precise + size[Size.GAIN] + m * groups + g
+                P[at] = P[at] + change * factor
+
+    @ti.func
+    def shorten(slot: ti.template(), size: ti.template(), P: ti.template(), p: ti.template()):
+        """Go back by half the last step."""
+        s, groups = scalars(slot, size), size[Size.IMAGE_GROUPS]
+        p[s + Scalar.BACK] *= 0.5
+        for i in range(size[Size.UNKNOWNS]):
+            u = size[Size.LIST + i]
+            p[s + Scalar.Q + u] = p[s + Scalar.ACCEPTED + u] + p[s + Scalar.BACK] * p[s + Scalar.STEP + i]
+        for m in range(size[Size.TERMS]):
+            for g in range(groups):
+                to = slot.precise + size[Size.GAIN_STEP] + m * groups + g
+                P[to] = P[to] * 0.5
+                at = slot.precise + size[Size.GAIN] + m * groups + g
+                P[at] = P[at] - P[to]
+
+    @ti.func
+    def step(slot: ti.template(), size: ti.template(), value: ti.template(), P: ti.template(), p: ti.template()):
+        """Solve the normal equations and go one step."""
+        s, n = scalars(slot, size), size[Size.UNKNOWNS]
+        photometry(slot, size, p)
+        centre_moves(slot, size, P, p)
+        normal_equations(slot, s + Scalar.METRIC, 0, size, P, p)
+        right_side(slot, size, P, p)
+        scaled_factor(slot, size, P, p)
+        lost = precise(0.0)
+        for i in range(n):
+            p[s + Scalar.STEP + i] = 0.0 - p[s + Scalar.RIGHT + i] * p[s + Scalar.SCALE + i]
+            if p[s + Scalar.FIXED + i] > 0.5:
+                p[s + Scalar.STEP + i] = precise(0.0)
+                if size[Size.LIST + i] < 12:
+                    lost = precise(1.0)
+        substitute(s + Scalar.NORMAL, n, s + Scalar.STEP, 1, p)
+        square = precise(0.0)
+        for i in range(n):
+            p[s + Scalar.STEP + i] *= p[s + Scalar.SCALE + i]
+            square -= p[s + Scalar.STEP + i] * p[s + Scalar.RIGHT + i]
+        far = farthest(slot, size, value, P, p)
+        factor = ti.min(precise(1.0), LONGEST_STEP / ti.max(far, precise(1e-30)))
+        # Moves are about their mean, so the images move by up to twice as much.
+        p[s + Scalar.DRIFT] += 2.0 * far * factor
+        for i in range(n):
+            p[s + Scalar.STEP + i] *= factor
+            u = size[Size.LIST + i]
+            p[s + Scalar.Q + u] = p[s + Scalar.ACCEPTED + u] + p[s + Scalar.STEP + i]
+        change_gains(slot, factor, size, P, p)
+        p[s + Scalar.BACK] = precise(1.0)
+        p[s + Scalar.LAST] = square
+        if p[s + Scalar.PASSES] < 1.5:
+            p[s + Scalar.FIRST] = square
+        # In standard errors: the noise of the sums is correlated and weighted.
+        error = p[s + Scalar.COST] * value[Value.CORRELATION] * ti.cast(n, precise)
+        if square < CONVERGED * error and factor > 0.999:
+            p[s + Scalar.DONE] = precise(1.0)
+        if lost > 0.5 or not (far < 1e6):
+            p[s + Scalar.DONE], p[s + Scalar.CODE] = precise(1.0), singular
+
+    @ti.func
+    def solve(
+        slot: ti.template(), size: ti.template(), value: ti.template(), image: ti.template(), P: ti.template(),
+        p: ti.template(),
+    ):  # fmt: skip
+        """Judge the pass, and go a step further, or half a step back; the pass after the last one only judges."""
+        s = scalars(slot, size)
+        p[s + Scalar.PASSES] += 1.0
+        passes = ti.cast(p[s + Scalar.PASSES], ti.i32)
+        weigh(slot, size, image, P, p)
+        cost = p[s + Scalar.COST]
+        if passes == 1:
+            p[s + Scalar.START] = cost
+        if p[s + Scalar.IMAGES] < 2.0:
+            p[s + Scalar.DONE], p[s + Scalar.CODE] = precise(1.0), empty
+        elif passes > 1 and not (cost <= p[s + Scalar.BEST] * 1.001):
+            shorten(slot, size, P, p)
+            if passes >= size[Size.STEPS]:
+                p[s + Scalar.DONE], p[s + Scalar.CODE] = precise(1.0), worse
+        else:
+            p[s + Scalar.BEST] = cost
+            for i in range(MAX_UNKNOWNS):
+                p[s + Scalar.ACCEPTED + i] = p[s + Scalar.Q + i]
+            step(slot, size, value, P, p)
+            if passes >= size[Size.STEPS] and p[s + Scalar.DONE] < 0.5:
+                p[s + Scalar.DONE] = precise(1.0)
+                error = cost * value[Value.CORRELATION] * ti.cast(size[Size.UNKNOWNS], precise)
+                if p[s + Scalar.LAST] > ti.max(LAST_STEP * error, CONTRACTED * p[s + Scalar.FIRST]):
+                    p[s + Scalar.CODE] = not_converged
+        p[s + Scalar.ROBUST] = TUKEY * TUKEY * cost
+        p[s + Scalar.RESAMPLE] = precise(0.0)
+        if p[s + Scalar.DRIFT] > DRIFT:
+            p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
+
+    @ti.func
+    def finish(
+        slot: ti.template(), pixel: ti.i32, size: ti.template(), P: ti.template(), p: ti.template(), out: ti.template()
+    ):
+        """Results and their covariance ``σ² H^-1 S H^-1``; NaN rows where the data do not determine an unknown."""
+        s, n = scalars(slot, size), size[Size.UNKNOWNS]
+        to = pixel * Out.N
+        out[to + Out.CODE], out[to + Out.PASSES] = p[s + Scalar.CODE], p[s + Scalar.PASSES]
+        out[to + Out.START], out[to + Out.COST] = p[s + Scalar.START], p[s + Scalar.COST]
+        for i in range(MAX_UNKNOWNS):
+            out[to + Out.Q + i] = p[s + Scalar.Q + i]
+        for i in range(MAX_UNKNOWNS * MAX_UNKNOWNS):
+            out[to + Out.COVARIANCE + i] = precise(0.0)
+        # The factor of H is still there; NORMAL takes Σ ω² C^T S C.
+        for i in range(n):
+            for j in range(n):
+                p[s + Scalar.INVERSE + i * n + j] = ti.cast(i == j, precise)
+            substitute(s + Scalar.NORMAL, n, s + Scalar.INVERSE + i * n, 1, p)
+        normal_equations(slot, s + Scalar.NOISE, 1, size, P, p)
+        for i in range(n):
+            for j in range(i + 1):
+                element = total(P[slot.precise + size[Size.NORMAL] + i * (i + 1) // 2 + j])
+                element *= p[s + Scalar.SCALE + i] * p[s + Scalar.SCALE + j]
+                p[s + Scalar.NORMAL + i * n + j] = element
+                p[s + Scalar.NORMAL + j * n + i] = element
+        images = p[s + Scalar.IMAGES]
+        # The texture takes one image's worth of residuals, the photometric terms a few samples' of each.
+        left = (1.0 - 1.0 / images) * ti.max(1.0 - ti.cast(size[Size.TERMS], precise) / p[s + Scalar.EFFECTIVE], precise(0.1))
+        variance = p[s + Scalar.COST] / left
+        for i in range(n):
+            for j in range(n):
+                element = precise(0.0)
+                for k in range(n):
+                    element += p[s + Scalar.INVERSE + i * n + k] * p[s + Scalar.NORMAL + k * n + j]
+                p[s + Scalar.SPREAD + i * n + j] = element
+        for i in range(n):
+            for j in range(n):
+                element = precise(0.0)
+                for k in range(n):
+                    element += p[s + Scalar.SPREAD + i * n + k] * p[s + Scalar.INVERSE + k * n + j]
+                element *= variance * p[s + Scalar.SCALE + i] * p[s + Scalar.SCALE + j]
+                fixed = p[s + Scalar.FIXED + i] + p[s + Scalar.FIXED + j] > 0.5
+                a, b = size[Size.LIST + i], size[Size.LIST + j]
+                out[to + Out.COVARIANCE + a * MAX_UNKNOWNS + b] = ti.select(fixed, precise(-1.0), element)
+
+    @ti.func
+    def masses(slot: ti.template(), size: ti.template(), r: ti.template(), p: ti.template()):
+        """Weight of the window, and how many samples of equal weight it stands for."""
+        s = scalars(slot, size)
+        first = (slot.real + size[Size.WEIGHT]) * lanes
+        one, two = precise(0.0), precise(0.0)
+        for i in range(size[Size.SAMPLES]):
+            w = ti.cast(r[first + i], precise)
+            one += w
+            two += w * w
+        p[s + Scalar.MASS] = one
+        p[s + Scalar.EFFECTIVE] = one * one / ti.max(two, precise(1e-30))
+
+    return SimpleNamespace(begin=begin, masses=masses, solve=solve, finish=finish)

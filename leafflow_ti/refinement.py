@@ -1,0 +1,150 @@
+"""Refined maps: starts from those of a model, refinement of single pixels, and what follows from its parameters.
+
+Where the refinement does not converge from a pixel's own start it is tried once more from the plane and the motion that
+a neighbour has arrived at. Pixels that it does not improve keep the values of the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.capture import Geometry
+from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
+from leafflow_ti.refine_plan import Refinement
+from leafflow_ti.stages.refine import Refined, RefineStage
+from leafflow_ti.status import HAS_VALUE, Status
+
+Array = NDArray[Any]
+Maps = dict[str, Array]
+PARAMETERS = ("depth", "slope_x", "slope_y", *MOTION_NAMES)
+"""Maps that are parameters themselves, in their order; growth rates stand behind them."""
+_GROWTH = len(PARAMETERS)
+_NEIGHBOURS = ((0, -1), (0, 1), (-1, 0), (1, 0))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Output pixels of some maps: image positions of rows ``y`` and columns ``x``, and of the block's first pixel."""
+
+    y: range
+    x: range
+    corner: tuple[int, int]
+    geometry: Geometry
+
+    def rays(self, rows: Array, cols: Array) -> Array:
+        """Positions [n, 2] from the principal point, px."""
+        x, y = np.array(self.x)[cols], np.array(self.y)[rows]
+        return np.stack([x - self.geometry.principal_px[0], y - self.geometry.principal_px[1]], axis=1).astype(float)
+
+
+def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place) -> None:
+    """Refine every pixel that has a value, in place of ``maps`` [rows, cols] and ``status``.
+
+    ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at.
+    """
+    rows, cols = np.nonzero(np.isin(status, HAS_VALUE))
+    if not rows.size:
+        return
+    start = np.zeros((rows.size, _GROWTH + 3))
+    for i, name in enumerate(PARAMETERS):
+        if name in maps:
+            start[:, i] = np.nan_to_num(maps[name][rows, cols])
+    found = _call(stage, place, rows, cols, start)
+    good = found.converged
+    parameters, covariance = found.parameters, found.covariance
+    again, begin = _neighbours(rows, cols, found, place, status.shape)
+    if again.size:
+        second = _call(stage, place, rows[again], cols[again], begin)
+        better = again[second.converged]
+        parameters[better], covariance[better] = (
+            second.parameters[second.converged], second.covariance[second.converged]
+        )  # fmt: skip
+        good[better] = True
+    kept = ~good & (status[rows, cols] == Status.OK)
+    status[rows[kept], cols[kept]] = Status.UNREFINED
+    rows, cols = rows[good], cols[good]
+    derived = _derived(plan, parameters[good], covariance[good], place.rays(rows, cols), place.geometry.f_px)
+    if "disparity" in maps:
+        before = maps["disparity"][rows, cols].astype(float) * maps["depth"][rows, cols]
+        depth, std = derived["depth"]
+        derived["disparity"] = before / depth, np.abs(before) / depth**2 * std
+    for name, (values, std) in derived.items():
+        for full, found_values in ((name, values), (f"{name}_std", std)):
+            if full in maps:
+                maps[full][rows, cols] = found_values
+
+
+def _call(stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array) -> Refined:
+    y, x = np.array(place.y)[rows] - place.corner[0], np.array(place.x)[cols] - place.corner[1]
+    return stage(y, x, place.rays(rows, cols), start)
+
+
+def _neighbours(
+    rows: Array, cols: Array, found: Refined, place: Place, shape: tuple[int, ...]
+) -> tuple[NDArray[np.intp], Array]:
+    """Which pixels to try again, and their starts: from the best of the four neighbours that converged."""
+    index = np.full((shape[0] + 2, shape[1] + 2), -1)
+    index[rows + 1, cols + 1] = np.where(found.converged, np.arange(rows.size), -1)
+    failed = np.flatnonzero(~found.converged)
+    around = np.stack([index[rows[failed] + 1 + dy, cols[failed] + 1 + dx] for dy, dx in _NEIGHBOURS], axis=1)
+    cost = np.where(around >= 0, found.cost[around], np.inf)
+    best = np.take_along_axis(around, cost.argmin(axis=1)[:, None], axis=1)[:, 0]
+    failed, best = failed[best >= 0], best[best >= 0]
+    rays, f = place.rays(rows, cols), place.geometry.f_px
+    return failed, transferred(found.parameters[best], rays[best] / f, rays[failed] / f)
+
+
+def transferred(parameters: Array, seen: Array, wanted: Array) -> Array:
+    """Parameters [n, 15] of the patches seen at the rays ``seen`` [n, 2], for their points at the rays ``wanted``.
+
+    The plane stays, and its points move with it: N + Ω × P + A's share Ω × (Ω × P), without the small growth.
+    """
+    result = parameters.copy()
+    zx, zy = parameters[:, 1], parameters[:, 2]
+    slant = [1 - zx * r[:, 0] - zy * r[:, 1] for r in (seen, wanted)]
+    result[:, 0] = parameters[:, 0] * slant[0] / slant[1]
+    one = np.ones((len(seen), 1))
+    before, after = (depth[:, None] * np.hstack([r, one]) for depth, r in
+                     ((parameters[:, 0], seen), (result[:, 0], wanted)))  # fmt: skip
+    omega = parameters[:, 6:9]
+    turning = np.cross(omega, after - before)
+    result[:, 3:6] += turning
+    result[:, 9:12] += np.cross(omega, turning)
+    return result
+
+
+def _derived(
+    plan: Refinement, q: Array, covariance: Array, rays: Array, f: float
+) -> dict[str, tuple[Array, Array]]:
+    """Maps and standard errors [n] from parameters [n, 15] and their covariance."""
+
+    def linear(gradient: dict[int, Array | float]) -> Array:
+        """Standard error of a function of this gradient; infinite where one of its parameters is not determined."""
+        total, lost = np.zeros(len(q)), np.zeros(len(q), bool)
+        for i, a in gradient.items():
+            lost |= covariance[:, i, i] < 0
+            for j, b in gradient.items():
+                total += a * b * covariance[:, i, j]
+        return np.where(lost, np.inf, np.sqrt(np.maximum(total, 0)))
+
+    found = {name: (q[:, i], linear({i: 1.0})) for i, name in enumerate(PARAMETERS[: 3 + plan.motion])}
+    if plan.motion:
+        for k, axis in enumerate("xy"):
+            flow = (f * q[:, 3 + k] - rays[:, k] * q[:, 5]) / q[:, 0]
+            gradient = {0: -flow / q[:, 0], 3 + k: f / q[:, 0], 5: -rays[:, k] / q[:, 0]}
+            found[f"flow_{axis}"] = flow, linear(gradient)
+    if plan.modes:
+        one, two, both = (q[:, _GROWTH + (i if plan.modes == 3 else 0)] for i in range(3))
+        both = both if plan.modes == 3 else np.zeros(len(q))
+        area = [(1 + s * one / 2) * (1 + s * two / 2) - both**2 / 4 for s in (1, -1)]
+        rate = linear({_GROWTH: 200.0} if plan.modes == 1 else {_GROWTH: 100.0, _GROWTH + 1: 100.0})
+        found["growth_rate"] = np.where(np.isfinite(rate), 100 * (area[0] / area[1] - 1), np.nan), rate
+    if plan.modes == 3:
+        for i, name in enumerate(STRAIN_NAMES):
+            std = linear({_GROWTH + i: 100.0})
+            found[name] = np.where(np.isfinite(std), 100 * q[:, _GROWTH + i], np.nan), std
+    return found

@@ -1,0 +1,74 @@
+"""Quintic B-splines: their pieces, and the filter from grey values to the coefficients of the smoothed image.
+
+The basis function has the support -3..3; between two pixels a point ``u`` behind the left one has six neighbours.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+DEGREE = 5
+SUPPORT = 3
+"""Reach of the basis function [px]."""
+PREFILTER_SIGMA = 0.7
+"""Gaussian of the images [px]: below, interpolation errs; above, texture is lost."""
+LEAST_TAP = 1e-7
+"""Taps below this share of the largest are left out: the rounding of single precision."""
+_PERIOD = 1024
+
+
+@functools.cache
+def spline_pieces() -> Array:
+    """Weights of the neighbours as polynomials of u: [derivative 0..2, neighbour 0..5, power 0..5].
+
+    Neighbour m lies ``m - 2`` pixels behind the pixel left of the point.
+    """
+    # Cardinal splines of support 0..n+1, piece by piece: n β_n(x) = x β_(n-1)(x) + (n + 1 - x) β_(n-1)(x - 1).
+    pieces = [np.polynomial.Polynomial([1.0])]
+    for n in range(1, DEGREE + 1):
+        padded = [np.polynomial.Polynomial([0.0]), *pieces, np.polynomial.Polynomial([0.0])]
+        pieces = [
+            (np.polynomial.Polynomial([j, 1]) * padded[j + 1] + np.polynomial.Polynomial([n + 1 - j, -1]) * padded[j]) / n
+            for j in range(n + 1)
+        ]  # fmt: skip
+    found = np.zeros((3, DEGREE + 1, DEGREE + 1))
+    for m, piece in enumerate(reversed(pieces)):
+        for d in range(3):
+            coefficients = piece.deriv(d).coef if d else piece.coef
+            found[d, m, : len(coefficients)] = coefficients
+    found.flags.writeable = False  # shared by all who ask
+    return found
+
+
+def spline(u: Array) -> Array:
+    """The basis function at ``u`` px from its centre."""
+    inside = (u > -SUPPORT) & (u < SUPPORT)
+    left = np.floor(u)
+    neighbour = np.where(inside, 2 - left, 0).astype(int)
+    powers = np.power.outer(u - left, np.arange(DEGREE + 1))
+    return np.asarray(np.where(inside, np.sum(spline_pieces()[0][neighbour] * powers, axis=-1), 0.0))
+
+
+@functools.cache
+def filter_taps() -> Array:
+    """Symmetric kernel from grey values to spline coefficients of the smoothed image, float64 [2 radius + 1].
+
+    A Gaussian of ``PREFILTER_SIGMA`` and the inverse of the sampled spline, along one axis; the sum is 1.
+    """
+    offset = np.fft.fftfreq(_PERIOD, 1 / _PERIOD)
+    gaussian = np.exp(-0.5 * (offset / PREFILTER_SIGMA) ** 2)
+    taps = np.fft.fftshift(np.fft.ifft(np.fft.fft(gaussian) / np.fft.fft(spline(offset)).real).real)
+    radius = int(np.abs(np.flatnonzero(np.abs(taps) >= LEAST_TAP * taps.max()) - _PERIOD // 2).max())
+    taps = taps[_PERIOD // 2 - radius : _PERIOD // 2 + radius + 1]
+    taps = np.asarray(taps / taps.sum())
+    taps.flags.writeable = False
+    return taps
+
+
+FILTER_RADIUS = len(filter_taps()) // 2
+"""Pixels that a coefficient needs on each side."""

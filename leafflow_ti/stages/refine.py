@@ -1,0 +1,338 @@
+"""Host side of the exact refinement: spline coefficients of the frames in the window, tables, launches."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.refine_plan import PIXEL_VARIANCE, Refinement
+from leafflow_ti.runtime import Device
+from leafflow_ti.splines import FILTER_RADIUS, PREFILTER_SIGMA, SUPPORT, filter_taps, spline, spline_pieces
+from leafflow_ti.stages.estimate_tables import View
+from leafflow_ti.stages.planes import Filtering, round_up
+from leafflow_ti.trace import span
+
+Array = NDArray[Any]
+
+GPU_BYTES = 1 << 30
+"""Workspace of the pixels of one launch on a GPU."""
+LAUNCH_SECONDS = 0.3
+"""Of a launch on the CPU, about: an interrupt is noticed only between two."""
+SAMPLES_PER_SECOND = 5e7
+"""Warped samples that a thread makes at least."""
+SPOILT = 4
+"""Pixels around an invalid one whose coefficients it spoils: what it adds further away is below 1 %."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What became of some pixels [n]; see ``kernels.refine_tables.Code``.
+
+    ``parameters`` [n, 15]: Z0, ZX, ZY, N, Ω, A, growth rates (0 where not estimated); ``covariance`` [n, 15, 15], 0
+    where not estimated, -1 where the data do not determine an unknown. ``passes``: evaluations of the images; ``start``
+    and ``cost``: mean squared residual before and after.
+    """
+
+    code: NDArray[np.int64]
+    passes: NDArray[np.int64]
+    start: Array
+    cost: Array
+    parameters: Array
+    covariance: Array
+
+    @property
+    def converged(self) -> NDArray[np.bool_]:
+        """Where there is a refined result."""
+        from leafflow_ti.kernels.refine_tables import Code
+
+        return np.asarray((self.code == Code.REFINED) & np.isfinite(self.parameters).all(axis=1))
+
+
+class RefineStage:
+    """Refines pixels of bands of one size: blocks [rows, cols] of every camera, frame after frame.
+
+    ``view``: camera and shifts, as of ``EstimateStage``; its position in the image does not matter.
+    """
+
+    def __init__(self, device: Device, plan: Refinement, view: View, rows: int, cols: int):
+        self.device, self.plan, self.rows, self.cols = device, plan, rows, cols
+        self.pitch = round_up(cols, 64)
+        self._plane = rows * self.pitch
+        n, n_frames = len(plan.cameras), len(plan.frames)
+        self._coefficients = device.zeros(n * n_frames * self._plane)
+        self._slots: deque[int] = deque(maxlen=n_frames)
+        self._next = 0
+        self._filters = _filters(device, rows, self.pitch)
+        self._mask: Any = None
+        lanes = device.dense.lanes
+        tables = _Tables.of(plan, view, lanes, self.pitch)
+        self.size, self._slot_real, self._slot_precise = tables.size, tables.slot_real, tables.slot_precise
+        self._tables = (
+            device.array(tables.size, "int"), device.array(tables.value, "algebra"),
+            device.vectors(device.array(tables.image, "algebra"), lanes),
+        )  # fmt: skip
+        self._samples = device.vectors(device.array(tables.sample), lanes)
+        bytes_per_slot = lanes * (
+            tables.slot_real * np.dtype(device.real("storage")).itemsize
+            + tables.slot_precise * np.dtype(device.real("algebra")).itemsize
+        )
+        if device.gpu:
+            self._batch = max(1, GPU_BYTES // bytes_per_slot)
+            slots = self._batch
+        else:
+            slots = 8 * device.threads
+            samples = n * n_frames * plan.across**2 * (plan.steps + 1)
+            self._batch = max(slots, int(LAUNCH_SECONDS * device.threads * SAMPLES_PER_SECOND / samples))
+        self._real = device.zeros(slots * tables.slot_real * lanes)
+        self._precise = device.zeros(slots * tables.slot_precise * lanes, "algebra")
+        self._slots_n = slots
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self._slots.clear()
+        self._next = 0
+
+    def push(self, block: Array, finite: NDArray[np.bool_]) -> None:
+        """Take the next frame: images [sy, sx, rows, cols] and where each is a grey value of an image."""
+        from leafflow_ti.kernels.refine_tables import NOTHING
+
+        n = len(self.plan.cameras)
+        slot = self._next % len(self.plan.frames)
+        self._next += 1
+        self._slots.append(slot)
+        images, valid = (a.reshape(n, self.rows, self.cols) for a in (block, finite))
+        with span("splines"):
+            for k in range(n):
+                to = (slot * n + k) * self._plane
+                spoilt = None
+                image = images[k]
+                if not valid[k].all():
+                    image = _filled(image, valid[k])
+                    spoilt = _dilated(~valid[k], SPOILT)
+                self._filter(image, spoilt, to, NOTHING)
+
+    def _filter(self, image: Array, spoilt: NDArray[np.bool_] | None, to: int, nothing: float) -> None:
+        """Spline coefficients of one image; the outermost rows and columns, which lack neighbours, are none."""
+        along_y, along_x, padded, tall = self._filters
+        r = FILTER_RADIUS
+        wide = np.zeros((self.rows + 2 * r, self.pitch), image.dtype)
+        wide[r:-r, : self.cols] = image
+        self.device.write(padded, 0, wide)
+        along_y(padded, tall, r)
+        along_x(tall, self._coefficients, to)
+        edge = np.ones((self.rows, self.pitch), bool)
+        edge[r:-r, r : self.cols - r] = False if spoilt is None else spoilt[r:-r, r : self.cols - r]
+        if self.device.gpu:
+            plane = self.device.host(self._coefficients)[to : to + self._plane].copy()
+            plane[edge.ravel()] = nothing
+            self.device.write(self._coefficients, to, plane)
+        else:
+            self._coefficients[to : to + self._plane][edge.ravel()] = nothing
+
+    def set_mask(self, mask: NDArray[np.bool_] | None) -> None:
+        """Pixels [rows, cols] of the block that belong to the surface; None: all."""
+        self._mask = None
+        if mask is not None and not mask.all():
+            plane = np.zeros((self.rows, self.pitch), self.device.real("storage"))
+            plane[:, : self.cols] = mask
+            self._mask = self.device.array(plane)
+
+    def __call__(self, y: NDArray[np.int64], x: NDArray[np.int64], rays: Array, start: Array) -> Refined:
+        """Refine the pixels in rows ``y`` and columns ``x`` of the block [n].
+
+        ``rays`` [n, 2]: their positions from the principal point, px; ``start`` [n, 15]: parameters.
+        All frames of the window have been pushed.
+        """
+        from leafflow_ti.kernels.refine_tables import Out, Size
+
+        device, n = self.device, len(y)
+        with span("refine"):
+            frames = np.array([s for s in self._slots])
+            cameras = len(self.plan.cameras)
+            origin = ((frames[:, None] * cameras + np.arange(cameras)) * self._plane).ravel()
+            size = self.size.copy()
+            size[Size.MASKED] = int(self._mask is not None)
+            out = device.zeros(n * Out.N, "algebra")
+            device_size = device.array(size, "int")
+            arguments = (
+                device_size, *self._tables[1:], device.array(origin, "int"), self._samples, self._coefficients,
+                self._mask if self._mask is not None else device.zeros(1), device.array(y * self.pitch + x, "int"),
+                device.array(np.concatenate([rays, start], axis=1), "algebra"), *self._workspaces(), out,
+            )  # fmt: skip
+            for first in range(0, n, self._batch):
+                self._launch(first, min(self._batch, n - first), arguments)
+            found = np.array(device.host(out), float).reshape(n, Out.N)
+        return Refined(
+            found[:, Out.CODE].astype(np.int64), found[:, Out.PASSES].astype(np.int64), found[:, Out.START],
+            found[:, Out.COST], found[:, Out.Q : Out.COVARIANCE],
+            found[:, Out.COVARIANCE :].reshape(n, Out.COVARIANCE - Out.Q, Out.COVARIANCE - Out.Q),
+        )  # fmt: skip
+
+    def _workspaces(self) -> tuple[Any, ...]:
+        lanes, device = self.device.dense.lanes, self.device
+        return (
+            device.vectors(self._real, lanes), self._real, device.vectors(self._precise, lanes), self._precise,
+        )  # fmt: skip
+
+    def _launch(self, first: int, pixels: int, arguments: tuple[Any, ...]) -> None:
+        from leafflow_ti.kernels.refine import Stage, refine_kernel
+        from leafflow_ti.kernels.refine_tables import FUNCTIONS, SHIFTS, Size
+
+        spec = self.device.dense
+        if not self.device.gpu:
+            refine_kernel(spec)(first, pixels, 1, min(pixels, self._slots_n), *arguments)
+            return
+        size = self.size
+        parts = {
+            Stage.WINDOW: size[Size.SAMPLE_GROUPS], Stage.PREPARE: size[Size.IMAGE_GROUPS],
+            Stage.HAND_OVER: size[Size.IMAGES], Stage.WARP: size[Size.SAMPLE_GROUPS],
+            Stage.TEXTURE: size[Size.SAMPLE_GROUPS], Stage.GRAM: FUNCTIONS,
+            Stage.SUMS: size[Size.IMAGES], Stage.SPREAD: SHIFTS, Stage.NOISE: SHIFTS,
+        }  # fmt: skip
+
+        def launch(stages: range) -> None:
+            for stage in map(Stage, stages):
+                refine_kernel(spec, stage)(first, pixels, int(parts.get(stage, 1)), 1, *arguments)
+
+        launch(range(Stage.BEGIN, Stage.AIM))
+        for _ in range(self.plan.steps):
+            launch(range(Stage.AIM, Stage.SPREAD))
+        launch(range(Stage.SPREAD, Stage.FINISH + 1))
+
+
+@dataclass(frozen=True)
+class _Tables:
+    """Tables of the kernels on the host, and the sizes of a pixel's workspaces in vectors."""
+
+    size: NDArray[np.int32]
+    value: Array
+    image: Array
+    sample: Array
+    slot_real: int
+    slot_precise: int
+
+    @classmethod
+    def of(cls, plan: Refinement, view: View, lanes: int, pitch: int) -> _Tables:
+        from leafflow_ti.kernels.refine_tables import (
+            DERIVATIVES, FUNCTIONS, SHIFTS, TERMS, Geometry, Image, Scalar, Size, Value, Warp,
+        )  # fmt: skip
+
+        unknowns = _unknowns(plan)
+        n, k = len(unknowns), len(plan.frames) * len(plan.cameras)
+        images = -(-k // lanes)
+        offsets = plan.thin * (np.arange(plan.across) - plan.across // 2)
+        n_samples = plan.across**2
+        groups = -(-n_samples // lanes)
+        size = np.zeros(Size.LIST + n, np.int32)
+        size[Size.LIST :] = unknowns
+        correlation = _noise_correlation(plan.thin)
+        for name, entry in {
+            Size.UNKNOWNS: n, Size.MODES: plan.modes, Size.TERMS: plan.terms, Size.IMAGES: k,
+            Size.IMAGE_GROUPS: images, Size.SAMPLES: n_samples, Size.SAMPLE_GROUPS: groups, Size.ACROSS: plan.across,
+            Size.STEPS: plan.steps, Size.PITCH: pitch, Size.NEIGHBOURS: len(correlation) - 1,
+        }.items():  # fmt: skip
+            size[name] = entry
+        warps = -(-k * Warp.N // lanes)
+        slot_real = _lay_out(size, {
+            Size.SEEN: DERIVATIVES * k * groups, Size.VALUES: k * groups, Size.TEXTURE: groups, Size.BEFORE: groups, Size.FUNCTION: FUNCTIONS * groups,
+            Size.BLUR: 3 * groups, Size.WEIGHT: groups, Size.SCRATCH: 2 * SHIFTS * groups, Size.WARP: warps,
+        })  # fmt: skip
+        slot_precise = _lay_out(size, {
+            Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
+            Size.TRUST: images, Size.GAIN: TERMS * images, Size.GAIN_STEP: TERMS * images,
+            Size.HOMOGRAPHY: Warp.GAIN * images, Size.PRODUCT: SHIFTS, Size.NORMAL: n * (n + 1) // 2, Size.RIGHT: n,
+            Size.SCALAR: -(-Scalar.N // lanes), Size.GEOMETRY: Geometry.N,
+        })  # fmt: skip
+        size[Size.SLOT_REAL], size[Size.SLOT_PRECISE] = slot_real, slot_precise
+
+        sample = np.zeros((3, groups * lanes))
+        sample[0, :n_samples], sample[1, :n_samples] = np.tile(offsets, plan.across), np.repeat(offsets, plan.across)
+        weights = np.exp(-0.5 * (sample[0, :n_samples] ** 2 + sample[1, :n_samples] ** 2) / plan.sigma**2)
+        sample[2, :n_samples] = weights / weights.sum()
+
+        image = np.zeros((Image.N, images * lanes))
+        steps = np.array(plan.cameras, float)
+        image[Image.PRESENT, :k] = 1
+        image[Image.TIME, :k] = np.repeat(plan.frames, len(steps))
+        for axis in range(2):
+            image[Image.CAMERA_X + axis, :k] = np.tile(steps[:, axis] * view.baseline_mm[axis], len(plan.frames))
+            image[Image.SHIFT_X + axis, :k] = np.tile(steps[:, axis] * view.shift_px[axis], len(plan.frames))
+
+        value = np.zeros(Value.CORRELATION_AT + len(correlation))
+        value[Value.FOCAL], value[Value.HALF] = view.f_px, plan.size / 2
+        value[Value.SMOOTHING] = 0.5 * (PIXEL_VARIANCE + PREFILTER_SIGMA**2)
+        value[Value.LIMIT] = plan.size // 2 + plan.reach
+        both = 2 * correlation.sum() - 1
+        value[Value.CORRELATION] = both**2 * np.sum(sample[2] ** 2) / np.sum(sample[2])
+        value[Value.SPLINE : Value.CORRELATION_AT] = spline_pieces().ravel()
+        value[Value.CORRELATION_AT :] = correlation
+        return cls(size, value, image, sample, slot_real, slot_precise)
+
+
+def _unknowns(plan: Refinement) -> list[int]:
+    """Which of the fifteen parameters are estimated."""
+    from leafflow_ti.kernels.refine_tables import GROWTH
+
+    return [*range(3 + plan.motion), *range(GROWTH, GROWTH + plan.modes)]
+
+
+def _lay_out(size: NDArray[np.int32], lengths: dict[Any, int]) -> int:
+    """Put regions behind one another, their first elements into ``size``; the length of all."""
+    at = 0
+    for name, length in lengths.items():
+        size[name] = at
+        at += length
+    return at
+
+
+def _noise_correlation(thin: int) -> Array:
+    """Correlation of the noise of warped images at 0, ``thin``, 2 ``thin``, ... px, until it is below 1e-3.
+
+    White noise that is filtered and interpolated at positions that fall anywhere between the pixels has, on average,
+    the autocorrelation of the cardinal spline of the filter.
+    """
+    fine = 32
+    taps = filter_taps()
+    radius = FILTER_RADIUS + SUPPORT
+    u = np.arange(-radius * fine, radius * fine + 1) / fine
+    impulse = np.sum([tap * spline(u - r) for r, tap in enumerate(taps, -FILTER_RADIUS)], axis=0)
+    found = np.correlate(impulse, impulse, "full")
+    found = found[len(u) - 1 :: thin * fine] / found[len(u) - 1]
+    return np.asarray(found[: int(np.flatnonzero(np.abs(found) > 1e-3).max()) + 1])
+
+
+def _filters(device: Device, rows: int, pitch: int) -> tuple[Filtering, Filtering, Any, Any]:
+    """Filters along y and x, and the arrays between them: [rows + 2 radius, pitch], and [rows, pitch] behind radius."""
+    taps, r = filter_taps().tolist(), FILTER_RADIUS
+    along_y = Filtering(device, [[(i * pitch, w) for i, w in enumerate(taps)]], rows, pitch, pitch)
+    along_x = Filtering(device, [list(enumerate(taps))], rows, pitch, pitch)
+    padded = device.zeros((rows + 2 * r) * pitch)
+    return along_y, along_x, padded, device.zeros(rows * pitch + 2 * r + pitch)
+
+
+def _filled(image: Array, valid: NDArray[np.bool_]) -> Array:
+    """The image with invalid pixels replaced by the nearest valid one to the left, else to the right, else above."""
+    cols = np.arange(image.shape[1])
+    left = np.maximum.accumulate(np.where(valid, cols, -1), axis=1)
+    right = np.minimum.accumulate(np.where(valid, cols, image.shape[1])[:, ::-1], axis=1)[:, ::-1]
+    nearest = np.where(left >= 0, left, np.where(right < image.shape[1], right, 0))
+    filled = np.take_along_axis(image, nearest, axis=1)
+    some = valid.any(axis=1)
+    if not some.all() and some.any():
+        rows = np.flatnonzero(some)
+        filled = filled[rows[np.abs(rows[None, :] - np.arange(len(some))[:, None]).argmin(axis=1)]]
+    return np.ascontiguousarray(filled)
+
+
+def _dilated(spoilt: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    """Pixels within ``radius`` rows and columns of a spoilt one."""
+    for axis in range(2):
+        counts = np.cumsum(np.pad(spoilt.astype(np.int32), [(radius + 1, radius) if a == axis else (0, 0) for a in range(2)]), axis=axis)
+        n = spoilt.shape[axis]
+        ends = np.arange(n) + 2 * radius + 1
+        spoilt = np.take(counts, ends, axis=axis) - np.take(counts, ends - 2 * radius - 1, axis=axis) > 0
+    return spoilt
