@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from leafflow_ti.refine_plan import PIXEL_VARIANCE
+from leafflow_ti.splines import DEGREE, PREFILTER_SIGMA
 from leafflow_ti.synthetic.bound import eliminate, light_terms
 from leafflow_ti.synthetic.moving_patch import directions, pulled_back, warp, window, window_derivative
 
-PREFILTER_SIGMA = 0.85
-BLUR = 1.0 / 12.0 + PREFILTER_SIGMA**2
-ORDER = 3
+BLUR = PIXEL_VARIANCE + PREFILTER_SIGMA**2
 CORRELATED_PX = 6
 
 
@@ -63,12 +63,12 @@ class Refined:
 def coefficients(images):
     """Spline coefficients of the prefiltered images [K, H, W]."""
     smooth = (ndimage.gaussian_filter(np.asarray(i, float), PREFILTER_SIGMA, mode="mirror", truncate=8) for i in images)
-    return np.stack([ndimage.spline_filter(i, ORDER, mode="mirror") for i in smooth])
+    return np.stack([ndimage.spline_filter(i, DEGREE, mode="mirror") for i in smooth])
 
 
 def sample(spline, at):
     """Values [S] of a spline at positions [S, 2] (column, row)."""
-    return ndimage.map_coordinates(spline, at.T[::-1], order=ORDER, prefilter=False, mode="mirror")
+    return ndimage.map_coordinates(spline, at.T[::-1], order=DEGREE, prefilter=False, mode="mirror")
 
 
 def differences(spline, at):
@@ -116,7 +116,7 @@ def noise_correlation(distance):
     smoothing = np.exp(-0.5 * (taps / PREFILTER_SIGMA) ** 2)
     impulse = np.zeros(2 * reach + 1)
     impulse[reach + taps] = smoothing / smoothing.sum()
-    h = ndimage.map_coordinates(ndimage.spline_filter1d(impulse, ORDER), [u + reach], order=ORDER, prefilter=False)
+    h = ndimage.map_coordinates(ndimage.spline_filter1d(impulse, DEGREE), [u + reach], order=DEGREE, prefilter=False)
     product = np.correlate(h, h, "full") / fine
     lags = np.arange(-(u.size - 1), u.size) / fine
     return np.interp(np.abs(distance), lags, product)
