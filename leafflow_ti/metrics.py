@@ -30,6 +30,7 @@ TRUTH_MAPS: dict[str, int | None] = {
     "acceleration": 3,
     "flow": 2,
     "growth_rate": None,
+    "strain_rate": 3,
 }
 """Key of ``truth.npz`` -> components per pixel; None: a plain map."""
 
@@ -39,6 +40,9 @@ LABELS = ("face", "region")
 SCALARS = {"depth": "depth", "slope_x": "zx", "slope_y": "zy", "growth_rate": "growth_rate"}
 VECTORS = {"velocity": "velocity", "rotation": "omega", "acceleration": "acceleration", "flow": "flow"}
 """Map, or stem of the maps ``_x, _y[, _z]``, of the results -> key of the truth."""
+
+STRAINS = ("strain_rate_11", "strain_rate_22", "strain_rate_12")
+"""Maps of the components of the truth's ``strain_rate``."""
 
 ENDPOINT_UNITS = {"velocity": "mm", "flow": "px"}
 """Vectors whose distance to the truth is reported too, and its unit (per frame)."""
@@ -249,6 +253,9 @@ def _pairs(estimate: Maps, truth: Maps) -> Iterator[tuple[str, Array, Array]]:
             name = f"{stem}_{axis}"
             if name in estimate and key in truth:
                 yield name, np.asarray(estimate[name], np.float64), np.asarray(truth[key][..., k], np.float64)
+    for k, name in enumerate(STRAINS):
+        if name in estimate and "strain_rate" in truth:
+            yield name, np.asarray(estimate[name], np.float64), np.asarray(truth["strain_rate"][..., k], np.float64)
 
 
 def _errors(estimate: Maps, truth: Maps) -> Iterator[tuple[str, Array]]:
@@ -269,8 +276,9 @@ def _errors(estimate: Maps, truth: Maps) -> Iterator[tuple[str, Array]]:
     if "slope_x" in found and "slope_y" in found:
         (zx, zx_true), (zy, zy_true) = found["slope_x"], found["slope_y"]
         yield "normal_deg", normal_error(zx, zy, zx_true, zy_true)
-    if "growth_rate" in found:
-        yield "growth_rate_percent", found["growth_rate"][0] - found["growth_rate"][1]
+    for name in ("growth_rate", *STRAINS):
+        if name in found:
+            yield f"{name}_percent", found[name][0] - found[name][1]
 
 
 def _has_truth(truth: Maps, shape: tuple[int, int]) -> Mask:

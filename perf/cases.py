@@ -58,6 +58,15 @@ CASES = (
     Case("sequence", "sequence:run_sequence", "30 frames from files against 12: time per frame, peak memory"),
     Case("large", "sequence:run_large", "1600x1200 pixels by 9 cameras within a memory cap"),
     Case("scene-flow-ratio", "ratio:run", "affine-scene-flow against affine-4d on the same capture"),
+    Case("refine-cube", "refinement.cube:run_cube", "exact refinement of the rotating cube, against the affine start"),
+    Case("refine-light", "refinement.cube:run_light", "the same under a fixed spot, and under one on the camera"),
+    Case("refine-worse", "refinement.cube:run_worse", "share of the pixels of all scenes that refinement made worse"),
+    Case("refine-sinusoid", "refinement.sinusoid:run", "exact refinement of the sinusoid, and the Cramér-Rao bound"),
+    Case(
+        "refine-growth", "refinement.growth:run", "growth and strain of a moving, turning, tilted patch (tobacco rig)"
+    ),
+    Case("refine-coverage", "refinement.coverage:run", "whether the refinement's error bars are true, by noise"),
+    Case("refine-time", "refinement.timing:run", "what the refinement costs beside the affine stages, and by image"),
     Case("scaling", "scaling:run", "cost against image size, cameras, window, stride, sigma and columns, as a picture"),
 )
 

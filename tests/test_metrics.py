@@ -146,6 +146,15 @@ def test_growth_is_compared_in_percent() -> None:
     assert row.split()[2:4] == ["2", "0.3"]
 
 
+def test_strain_is_compared_by_component() -> None:
+    estimate = {"strain_rate_22": np.array([[0.3, 0.1]]), "strain_rate_22_std": np.array([[0.1, 0.1]])}
+    truth = {"strain_rate": np.array([[[0.0, 0.1, 0.0], [0.0, 0.1, 5.0]]])}
+    report = evaluate(estimate, truth, {"all": np.ones((1, 2), np.bool_)})["all"]
+    assert set(report.errors) == {"strain_rate_22_percent"}
+    assert report.errors["strain_rate_22_percent"].mean == pytest.approx(0.1)
+    assert report.coverage["strain_rate_22"].mean == pytest.approx(1.0)
+
+
 def test_evaluate_needs_something_in_common() -> None:
     everywhere = {"all": np.ones((1, 1), np.bool_)}
     with pytest.raises(InputError, match="nothing to compare"):

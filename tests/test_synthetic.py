@@ -11,8 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from leafflow_ti.errors import UsageError
 from leafflow_ti.synthetic.exact_flow import optical_flow
-from leafflow_ti.synthetic.geometry import plane_axes, rotation_matrix
-from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render, render_image, sinusoid_scene, truth
+from leafflow_ti.synthetic.geometry import plane_axes, rotation_matrix, tangent_axes
+from leafflow_ti.synthetic.plane import (
+    BrightnessTerm,
+    PlaneScene,
+    noise_scene,
+    render,
+    render_image,
+    sinusoid_scene,
+    truth,
+)
 
 SCENE = PlaneScene(
     f_px=700.0,
@@ -32,6 +40,9 @@ SCENE = PlaneScene(
     alpha=0.3,
     beta=0.7,
 )
+
+
+NOISE = replace(SCENE, texture="noise", wavelengths_mm=(2.0, 9.0), amplitude=25.0)
 
 
 def trajectory(scene: PlaneScene, start: np.ndarray, t: float) -> np.ndarray:
@@ -69,19 +80,78 @@ def test_plane_axes_are_the_smallest_turn_to_the_normal() -> None:
     assert np.linalg.norm(Rotation.from_matrix(axes).as_rotvec()) == pytest.approx(np.arccos(normal[2]), abs=1e-14)
 
 
+def test_tangent_axes_lie_in_the_plane() -> None:
+    axes, normal = tangent_axes(0.5, -0.8), plane_axes(0.5, -0.8)[:, 2]
+    np.testing.assert_allclose(axes.T @ axes, np.eye(2), atol=1e-15)
+    np.testing.assert_allclose(normal @ axes, 0.0, atol=1e-15)
+    np.testing.assert_allclose(np.cross(axes[:, 0], axes[:, 1]), normal, atol=1e-15)
+    assert axes[1, 0] == 0.0
+    assert axes[1, 1] > 0.0
+
+
 # --- texture and motion ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("scene", [SCENE, replace(NOISE, supersampling=1)], ids=["waves", "noise"])
 @pytest.mark.parametrize("start", [(1.5, -0.5), (-1.0, 1.2), (3.1, 0.4)])
-def test_a_material_point_keeps_its_grey_value(start: tuple[float, float]) -> None:
-    point = on_plane(SCENE, *start)
+def test_a_material_point_keeps_its_grey_value(scene: PlaneScene, start: tuple[float, float]) -> None:
+    point = on_plane(scene, *start)
     grey = [
-        grey_of_point(SCENE, trajectory(SCENE, point, frame - 2.0), frame, row, col)
+        grey_of_point(scene, trajectory(SCENE, point, frame - 2.0), frame, row, col)
         for frame in range(5)
         for row in range(3)
         for col in range(3)
     ]
-    np.testing.assert_allclose(grey, grey[0], rtol=1e-11)
+    np.testing.assert_allclose(grey, grey[0], rtol=1e-10)
+
+
+def test_strain_stretches_lengths_along_its_axes() -> None:
+    """The metric tensor of the moved axes is (1 + t E)², whatever the rigid motion."""
+    rates = np.array([0.02, -0.01, 0.015])
+    scene = replace(SCENE, strain=tuple(rates.tolist()), growth=0.005)
+    e1, e2 = tangent_axes(SCENE.zx, SCENE.zy).T
+    tensor = np.array([[0.025, 0.015], [0.015, -0.005]])
+    for t in (-2.0, 1.0, 2.0):
+        centre, first, second = (scene.place(p, t) for p in (np.zeros(3), e1, e2))
+        moved = np.stack([first - centre, second - centre])
+        np.testing.assert_allclose(centre, trajectory(SCENE, np.array(SCENE.centre), t), atol=1e-12)
+        np.testing.assert_allclose(moved @ moved.T, np.linalg.matrix_power(np.eye(2) + t * tensor, 2), atol=1e-12)
+        np.testing.assert_allclose(scene.material(first, t), e1, atol=1e-12)
+    h = 1e-3
+    points = np.array(SCENE.centre) + np.stack([e1, e2, 2.0 * e1 - e2])
+    before, now, after = (scene.place(points - np.array(SCENE.centre), t) for t in (-h, 0.0, h))
+    velocity, acceleration = scene.point_motion(points)
+    np.testing.assert_allclose(velocity, (after - before) / (2 * h), atol=1e-9)
+    np.testing.assert_allclose(acceleration, (after - 2 * now + before) / h**2, atol=1e-7)
+    maps = truth(scene)
+    np.testing.assert_allclose(maps["strain_rate"], np.broadcast_to([2.5, -0.5, 1.5], (16, 24, 3)), atol=1e-12)
+    # The area's rate is the trace but for terms of third order.
+    np.testing.assert_allclose(maps["growth_rate"], 100.0 * 0.02, atol=0.03)
+
+
+def test_growth_is_the_same_strain_in_all_directions() -> None:
+    one, other = replace(SCENE, growth=0.01), replace(SCENE, strain=(0.01, 0.01, 0.0))
+    np.testing.assert_array_equal(render(one, [0, 4]), render(other, [0, 4]))
+    assert np.abs(render(one, [4]) - render(SCENE, [4])).max() > 0.5
+
+
+def test_noise_is_averaged_over_the_pixel() -> None:
+    assert NOISE.rays_per_axis == 4
+    fine = replace(NOISE, supersampling=1, size=(96, 64), f_px=2800.0, principal_px=(47.5, 31.5))
+    image = render_image(fine, 1, 2, 0).reshape(16, 4, 24, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(render_image(NOISE, 1, 2, 0), image, rtol=1e-12)
+
+
+def test_noise_has_its_contrast_and_does_not_repeat() -> None:
+    image = render(noise_scene((161, 161)), [4], ([0], [4]))[0, 0, 0]
+    assert image.mean() == pytest.approx(100.0, abs=10.0)
+    assert image.std() == pytest.approx(25.0, rel=0.3)
+    spectrum = np.abs(np.fft.fft2((image - image.mean()) * np.outer(np.hanning(161), np.hanning(161)))) ** 2
+    correlation = np.fft.fftshift(np.fft.ifft2(spectrum).real) / spectrum.mean()
+    y, x = np.mgrid[-80:81, -80:81]
+    # The longest wave is 27 px: beyond it only what a few hundred independent waves leave by chance.
+    assert correlation[(x**2 + y**2 > 27**2)].max() < 0.5
+    assert np.abs(render(replace(noise_scene(), texture_seed=2), [4], ([0], [4]))[0, 0, 0] - image).max() > 20.0
 
 
 def test_texture_has_its_wavelengths_and_directions() -> None:
@@ -204,6 +274,12 @@ def test_bit_depth_rounds_and_clips(bits: int, scale: int) -> None:
         ({"baseline_mm": (0.0, 1.0)}, "baseline along x"),
         ({"centre": (0.0, 0.0, -1.0)}, "in front"),
         ({"wavelengths_mm": (0.0, 1.0)}, "wavelengths"),
+        ({"texture": "stripes"}, "texture 'stripes'"),
+        ({"texture": "noise", "wavelengths_mm": (2.0, 2.0)}, "shortest, then the longest"),
+        ({"supersampling": 0}, "supersampling = 0"),
+        ({"texture_seed": -1}, "texture_seed = -1"),
+        ({"strain": (0.0, 0.0, 0.6)}, "vanish within the 5 frames"),
+        ({"strain": (0.0, 0.0, float("nan"))}, "strain = nan"),
         ({"zx": float("nan")}, "zx = nan"),
         ({"velocity": (0.0, float("inf"), 0.0)}, "velocity = inf"),
     ],

@@ -126,7 +126,7 @@ def test_simulate_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         "--principal-px 5,4 --baseline-mm .7,.8 --centre-mm 1,2 --depth-mm 90 --slope-x -.3 --slope-y .2 "
         "--velocity -.1,.2,.3 --omega-deg .1,-.2,.3 --rotation-centre-mm 1,2,3 --acceleration .01,0,-.02 "
         "--offset 120 --amplitude 30 --wavelength-mm 2 --alpha-deg 30 --beta-deg 45 --brightness t,1,.01 "
-        "--brightness sx,2,.02,.03,.04 --growth .5"
+        "--brightness sx,2,.02,.03,.04 --growth .5 --strain .1,-.1,.2 --supersampling 2"
     )
     assert command("simulate", "plane", out, *options.split()) == 0
     assert "2 frames of 1 x 3 cameras" in capsys.readouterr().out
@@ -154,10 +154,20 @@ def test_simulate_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         beta=np.pi / 4,
         brightness=(plane.BrightnessTerm("t", 1, 0.01), plane.BrightnessTerm("sx", 2, 0.02, 0.03, 0.04)),
         growth=plane.linear_growth(0.5),
+        strain=(0.001, -0.001, 0.002),
+        supersampling=2,
     )
     np.testing.assert_array_equal(read_images(out, 2, 3), plane.render(scene)[:, 0])
-    np.testing.assert_allclose(np.load(out / "truth.npz")["growth_rate"], 0.5, rtol=1e-12)
+    np.testing.assert_allclose(np.load(out / "truth.npz")["growth_rate"], scene.growth_rate, rtol=1e-12)
     np.testing.assert_allclose(np.load(out / "truth.npz")["velocity"], plane.truth(scene)["velocity"], rtol=1e-12)
+
+
+def test_simulate_plane_with_noise(tmp_path: Path) -> None:
+    out = tmp_path / "p"
+    options = "--texture noise --texture-seed 5 --cameras 1 --frames 1 --size 30x20 --bits 16"
+    assert command("simulate", "plane", out, *options.split()) == 0
+    scene = replace(plane.noise_scene((30, 20)), n_cols=1, n_frames=1, texture_seed=5, bits=16)
+    np.testing.assert_array_equal(tifffile.imread(out / "image.tif"), plane.render(scene)[0, 0, 0])
 
 
 def test_simulate_cube(tmp_path: Path) -> None:
@@ -211,6 +221,8 @@ def test_simulate_cube(tmp_path: Path) -> None:
         (["plane", "--slope-x", "nan"], "zx = nan"),
         (["plane", "--growth", "-100"], "growth = -100 %/frame: an area cannot lose all of itself"),
         (["plane", "--growth", "70"], "would vanish within the 9 frames"),
+        (["plane", "--strain", "1,2"], "--strain 1,2: 3 numbers"),
+        (["plane", "--texture", "dots"], "texture 'dots'"),
         (["cube", "--light", "moon"], "light 'moon'"),
         (["cube", "--frames", "0"], "n_frames = 0"),
     ],

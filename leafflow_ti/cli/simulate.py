@@ -17,7 +17,7 @@ import typer
 from leafflow_ti.errors import UsageError
 
 if TYPE_CHECKING:
-    from leafflow_ti.synthetic.write import Scene
+    from leafflow_ti.synthetic.scene import Scene
 
 app = typer.Typer(
     name="simulate",
@@ -90,6 +90,10 @@ def _brightness(option: str, texts: list[str]) -> tuple[Any, ...]:
     return tuple(terms)
 
 
+def _percent_11_22_12(option: str, text: str) -> tuple[float, ...]:
+    return tuple(value / 100.0 for value in _numbers(3)(option, text))
+
+
 def _growth(option: str, percent: float) -> float:
     from leafflow_ti.synthetic.plane import linear_growth
 
@@ -121,6 +125,8 @@ FIELDS: dict[str, tuple[str, Callable[[str, Any], Any]]] = {
     "beta_deg": ("beta", _degrees),
     "brightness": ("brightness", _brightness),
     "growth": ("growth", _growth),
+    "strain": ("strain", _percent_11_22_12),
+    "texture": ("texture", _keep),
     # cube
     "edges_mm": ("edges_mm", _numbers(3)),
     "orientation_deg": ("orientation", _degrees_xyz),
@@ -167,10 +173,11 @@ Omega = Annotated[
 ]
 Pivot = Annotated[str | None, _option("rotation-centre-mm", "X,Y,Z", "Rotation centre, mm [centre of the object].")]
 Acceleration = Annotated[str | None, _option("acceleration", "X,Y,Z", "Acceleration of that point, mm/frame² [0,0,0].")]
+TextureSeed = Annotated[int | None, _option("texture-seed", "N", "Seed of a noise texture [1].")]
 Offset = Annotated[float | None, _option("offset", "GREY", "Mean grey value, of 8 bits [plane 100, cube 120].")]
 
 
-@app.command("plane", short_help="A moving plane with a cosine texture.", no_args_is_help=False)
+@app.command("plane", short_help="A moving plane with a cosine or noise texture.", no_args_is_help=False)
 def plane(
     context: typer.Context,
     folder: Folder,
@@ -194,9 +201,20 @@ def plane(
     rotation_centre_mm: Pivot = None,
     acceleration: Acceleration = None,
     offset: Offset = None,
-    amplitude: Annotated[float | None, _option("amplitude", "GREY", "Amplitude of the texture [50].")] = None,
+    texture: Annotated[
+        str | None,
+        _option("texture", "waves|noise", "A product of two cosines, or noise that does not repeat [waves]."),
+    ] = None,
+    texture_seed: TextureSeed = None,
+    supersampling: Annotated[
+        int | None, _option("supersampling", "N", "Rays per pixel: N x N [waves 1, noise 4].")
+    ] = None,
+    amplitude: Annotated[
+        float | None, _option("amplitude", "GREY", "Amplitude of waves [50], standard deviation of noise [25].")
+    ] = None,
     wavelength_mm: Annotated[
-        str | None, _option("wavelength-mm", "L1[,L2]", "Wavelengths of both cosines, mm [0.3].")
+        str | None,
+        _option("wavelength-mm", "L1[,L2]", "Wavelengths of both cosines [0.3], or range of the noise [0.25,1], mm."),
     ] = None,
     alpha_deg: Annotated[
         float | None, _option("alpha-deg", "DEG", "Turns the texture, or its first cosine, in the plane [0].")
@@ -214,11 +232,20 @@ def plane(
     growth: Annotated[
         float | None, _option("growth", "PERCENT", "Growth of its area about the centre, %/frame [0].")
     ] = None,
+    strain: Annotated[
+        str | None,
+        _option(
+            "strain",
+            "11,22,12",
+            "Strain rates of its lengths about the centre, %/frame, beside --growth; axis 1 lies in the plane above X "
+            "[0,0,0].",
+        ),
+    ] = None,
 ) -> None:
-    """A moving plane with a cosine texture; by default the sinusoid of Schuchert 2010, section 5.3."""
-    from leafflow_ti.synthetic.plane import sinusoid_scene
+    """A moving plane with a cosine or noise texture; by default the sinusoid of Schuchert 2010, section 5.3."""
+    from leafflow_ti.synthetic.plane import noise_scene, sinusoid_scene
 
-    _write(sinusoid_scene(), context.params)
+    _write(noise_scene() if texture == "noise" else sinusoid_scene(), context.params)
 
 
 @app.command("cube", short_help="A textured box that turns and moves.", no_args_is_help=False)
@@ -253,7 +280,7 @@ def cube(
     wavelength_mm: Annotated[
         str | None, _option("wavelength-mm", "MIN,MAX", "Wavelengths of the texture, mm [2.2,8].")
     ] = None,
-    texture_seed: Annotated[int | None, _option("texture-seed", "N", "Seed of the texture [1].")] = None,
+    texture_seed: TextureSeed = None,
     supersampling: Annotated[int | None, _option("supersampling", "N", "Rays per pixel: N x N [4].")] = None,
     light: Annotated[
         str | None,

@@ -19,19 +19,13 @@ from numpy.typing import NDArray
 from leafflow_ti.errors import UsageError
 from leafflow_ti.synthetic.geometry import Array, rotation_matrix
 from leafflow_ti.synthetic.motion import RigidScene
-from leafflow_ti.synthetic.noise_texture import noise_texture, sample
+from leafflow_ti.synthetic.noise_texture import albedo, noise_texture
 from leafflow_ti.synthetic.rig import Vector, render_grid
 
 Light = Literal["ambient", "spot", "spot-camera"]
 
 FACES = ((0, -1), (2, -1), (0, 1), (2, 1), (1, -1), (1, 1))
 """Box axis and side of each face; label = index + 1. In the default orientation 1 is left, 2 is right."""
-
-DARKEST = 1.0
-"""Lowest albedo in grey values: no point of the box is black, logarithms of the images stay finite."""
-
-BLOCK_ROWS = 8
-"""Image rows traced at once: the arrays of a block stay in the processor's cache."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,21 +108,18 @@ def render_image(scene: CubeScene, frame: int, row: int, col: int) -> Array:
     Raises UsageError if the camera stands inside the box.
     """
     camera, t = scene.camera_position(row, col), scene.time(frame)
-    n = scene.supersampling
-    x, y = scene.ray_axes(n)
-    width, height = scene.size
-    image = np.empty((height, width))
-    for top in range(0, height, BLOCK_ROWS):
-        bottom = min(top + BLOCK_ROWS, height)
-        block = np.full(((bottom - top) * n, width * n), scene.background)
-        for hits in _trace(scene, x, y[top * n : bottom * n], camera, t):
+
+    def shade(x: Array, y: Array) -> Array:
+        block = np.full((y.size, x.size), scene.background)
+        for hits in _trace(scene, x, y, camera, t):
             grey = _albedo(scene, hits)
             if scene.light != "ambient":
-                rays = _compressed_rays(x, y[top * n : bottom * n], hits.inside)
+                rays = _compressed_rays(x, y, hits.inside)
                 grey *= _light(scene, camera + hits.depth[:, None] * rays, hits.face, camera, t)
             block[hits.inside] = grey
-        image[top:bottom] = block.reshape(bottom - top, n, width, n).mean(axis=(1, 3))
-    return scene.expose(image, frame, row, col)
+        return block
+
+    return scene.expose(scene.integrate(shade, scene.supersampling), frame, row, col)
 
 
 def render(
@@ -212,8 +203,9 @@ def _normal(scene: CubeScene, face: int, t: float) -> Array:
 def _albedo(scene: CubeScene, hits: Hits) -> Array:
     """Grey values [n] of the texture under full light."""
     shortest, longest = scene.wavelengths_mm
-    field = noise_texture((scene.texture_seed, hits.face), max(scene.edges_mm), shortest, longest)
-    return np.maximum(scene.offset + scene.contrast * sample(field, max(scene.edges_mm), *hits.uv), DARKEST)
+    period = max(scene.edges_mm)
+    field = noise_texture((scene.texture_seed, hits.face), period, shortest, longest)
+    return albedo(field, period, *hits.uv, scene.offset, scene.contrast)
 
 
 def _compressed_rays(x: Array, y: Array, inside: NDArray[np.bool_]) -> Array:

@@ -33,3 +33,20 @@ def plane_axes(zx: float, zy: float) -> Array:
     normal = np.array([-zx, -zy, 1.0]) / np.sqrt(1.0 + zx * zx + zy * zy)
     k = cross_matrix((-normal[1], normal[0], 0.0))
     return np.asarray(np.eye(3) + k + k @ k / (1.0 + normal[2]))
+
+
+def tangent_axes(zx: float, zy: float) -> Array:
+    """Orthonormal tangents of the plane ``Z = ZX X + ZY Y`` as columns, [3, 2]: e1 above the X axis, e2 at y > 0.
+
+    ``e1 = (1, 0, ZX)/norm`` and ``e2 = n × e1`` with the normal ``n`` of ``plane_axes``: the axes of strain rates.
+    """
+    e1 = np.array([1.0, 0.0, zx]) / np.sqrt(1.0 + zx * zx)
+    return np.stack([e1, np.cross(plane_axes(zx, zy)[:, 2], e1)], axis=1)
+
+
+def in_plane(zx: float, zy: float, rates: ArrayLike) -> Array:
+    """The symmetric tensor [3, 3] with components ``rates`` (11, 22, 12) along ``tangent_axes``, none along the
+    normal."""
+    axes = tangent_axes(zx, zy)
+    r11, r22, r12 = np.asarray(rates, dtype=np.float64)
+    return np.asarray(axes @ np.array([[r11, r12], [r12, r22]]) @ axes.T)

@@ -17,6 +17,9 @@ from leafflow_ti.synthetic.geometry import Array
 SAMPLES_PER_WAVELENGTH = 40
 MAX_TABLE = 8192
 
+DARKEST = 1.0
+"""Lowest albedo in grey values: no point of a surface is black, logarithms of the images stay finite."""
+
 
 @lru_cache(maxsize=6)
 def noise_texture(seed: tuple[int, ...], period: float, shortest: float, longest: float) -> NDArray[np.float32]:
@@ -56,6 +59,13 @@ def sample(field: NDArray[np.float32], period: float, u: Array, v: Array) -> Arr
     upper = flat[rows + columns] * (1.0 - wu) + flat[rows + right] * wu
     lower = flat[below + columns] * (1.0 - wu) + flat[below + right] * wu
     return np.asarray(upper + wv * (lower - upper))
+
+
+def albedo(
+    field: NDArray[np.float32], period: float, u: Array, v: Array, offset: float, contrast: float
+) -> NDArray[np.float64]:
+    """Grey values [m] under full light of a texture with mean ``offset`` and standard deviation ``contrast``."""
+    return np.maximum(offset + contrast * sample(field, period, u, v), DARKEST)
 
 
 def _cell(position: Array, period: float, n: int) -> tuple[NDArray[np.intp], Array]:

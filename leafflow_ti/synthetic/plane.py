@@ -1,29 +1,37 @@
 """A textured plane that moves rigidly and may grow, rendered by exact ray/plane intersection (Schuchert 2010, App. B).
 
-The texture, fixed to the material, is
+The texture, fixed to the material, is either of
 
-    I = (o + a cos(2π xP/λ1) cos(2π yP/λ2)) exp(h)
+    I = (o + a cos(2π xP/λ1) cos(2π yP/λ2)) exp(h)                       waves
+    I = (o + a n(p, q)) exp(h)                                           noise n, wavelengths from λ1 to λ2, variance 1
     xP =  cos α p + sin α q,   yP = -sin β p + cos β q                   p, q: in-plane coordinates from the centre
 
 with ``p, q`` along the axes of the smallest rotation that turns (0, 0, 1) into the normal; α = β turns an orthogonal
-pattern in its plane, α ≠ β shears it. With growth g the material expands in its plane about the centre: what was at
-``(p, q)`` at t = 0 is at ``(1 + g t) (p, q)``.
+pattern in its plane, α ≠ β shears it. Waves are read at the pixel's centre, as in the dissertation; noise is averaged
+over its area. Growing material expands in its plane about the centre: what was at ``P`` at t = 0, relative to the
+centre, is at ``(1 + t E) P``, with the tensor E of its in-plane strain rates.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from leafflow_ti.errors import UsageError
-from leafflow_ti.synthetic.geometry import Array, plane_axes
+from leafflow_ti.synthetic.geometry import Array, in_plane, plane_axes
 from leafflow_ti.synthetic.motion import RigidScene
-from leafflow_ti.synthetic.rig import Vector, render_grid
+from leafflow_ti.synthetic.noise_texture import albedo, noise_texture
+from leafflow_ti.synthetic.rig import Vector, rays_of, render_grid
+
+Texture = Literal["waves", "noise"]
+
+NOISE_PERIOD = 64
+"""After so many of its shortest wavelengths a noise texture repeats itself."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +61,12 @@ class BrightnessTerm:
 class PlaneScene(RigidScene):
     """The plane ``Z = Z0 + ZX (X - X0) + ZY (Y - Y0)`` and its texture; motion and cameras are inherited.
 
-    ``alpha``, ``beta`` in rad (``beta`` None: equal to ``alpha``), ``offset`` and ``amplitude`` in grey values.
-    ``growth``: g [1/frame], of lengths; see ``linear_growth``.
+    ``alpha``, ``beta`` in rad (``beta`` None: equal to ``alpha``): of waves. ``offset`` and ``amplitude``: mean and
+    amplitude of waves, or mean and standard deviation of noise, in grey values. ``wavelengths_mm``: of both waves, or
+    the shortest and the longest of the noise. ``supersampling``: rays per pixel and axis, None: 1 for waves, 4 for
+    noise.
+    ``growth``: g [1/frame], of lengths, in all directions; see ``linear_growth``. ``strain`` [1/frame]: rates (11, 22,
+    12) along ``tangent_axes`` beside it.
     Raises UsageError for values that make no sense.
     """
 
@@ -68,17 +80,36 @@ class PlaneScene(RigidScene):
     beta: float | None = None
     brightness: tuple[BrightnessTerm, ...] = ()
     growth: float = 0.0
+    strain: Vector = (0.0, 0.0, 0.0)
+    texture: Texture = "waves"
+    texture_seed: int = 1
+    supersampling: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         ends = (self.time(0), self.time(self.n_frames - 1), -0.5, 0.5)
-        if min(self.size_at(t) for t in ends) <= 0.0:
+        lengths = [np.linalg.eigvalsh(self.deformation(t)).min() for t in ends]
+        if min(lengths) <= 0.0:
             raise UsageError(
-                f"growth = {self.growth:g} per frame: the plane would vanish within the {self.n_frames} frames: "
-                "choose less"
+                f"growth = {self.growth:g}, strain = {self.strain} per frame: the plane would vanish within the "
+                f"{self.n_frames} frames: choose less"
             )
         if min(self.wavelengths_mm) <= 0.0:
             raise UsageError(f"wavelengths {self.wavelengths_mm} mm: both must be positive")
+        if self.texture not in get_args(Texture):
+            raise UsageError(f"texture '{self.texture}': choose one of {', '.join(get_args(Texture))}")
+        if self.texture == "noise" and self.wavelengths_mm[0] >= self.wavelengths_mm[1]:
+            raise UsageError(f"wavelengths {self.wavelengths_mm} mm of noise: give the shortest, then the longest")
+        if self.supersampling is not None and self.supersampling < 1:
+            raise UsageError(f"supersampling = {self.supersampling}: at least 1 sample per pixel and axis is needed")
+        if self.texture_seed < 0:
+            raise UsageError(f"texture_seed = {self.texture_seed}: a seed cannot be negative")
+
+    @property
+    def rays_per_axis(self) -> int:
+        """Rays along each axis of a pixel."""
+        default = 4 if self.texture == "noise" else 1
+        return default if self.supersampling is None else self.supersampling
 
     def intersect(self, rays: Array, camera: Array, t: float) -> Array:
         """World points [..., 3] where rays [..., 3] from ``camera`` [3 or ..., 3] meet the plane at time ``t``.
@@ -96,34 +127,45 @@ class PlaneScene(RigidScene):
             )
         return np.asarray(camera + (distance / slant)[..., None] * rays)
 
-    def size_at(self, t: float) -> float:
-        """Lengths in the plane at ``t`` frames, relative to those at t = 0."""
-        return 1.0 + self.growth * t
+    @property
+    def strain_rates(self) -> Array:
+        """All in-plane strain rates (11, 22, 12) [3] along ``tangent_axes``, 1/frame: ``growth`` and ``strain``."""
+        return np.asarray(self.growth * np.array([1.0, 1.0, 0.0]) + np.array(self.strain))
+
+    def deformation(self, t: float) -> Array:
+        """The matrix ``1 + t E`` [3, 3] that takes offsets in the plane at t = 0 to those at ``t`` frames, unturned."""
+        return np.eye(3) + t * in_plane(self.zx, self.zy, self.strain_rates)
 
     @property
     def growth_rate(self) -> float:
         """Growth of the area between half a frame before and after t = 0, in %/frame."""
-        return 100.0 * ((self.size_at(0.5) / self.size_at(-0.5)) ** 2 - 1.0)
+        before, after = (float(np.linalg.det(self.deformation(t))) for t in (-0.5, 0.5))
+        return 100.0 * (after / before - 1.0)
 
     def place(self, offsets: Array, t: float) -> Array:
         """Where the material points ``offsets`` [..., 3] (see ``material``) are at time ``t``, in the world."""
         rotation, shift = self.pose(t)
-        return np.asarray((np.array(self.centre) + self.size_at(t) * offsets) @ rotation.T + shift)
+        return np.asarray((np.array(self.centre) + offsets @ self.deformation(t)) @ rotation.T + shift)
 
     def material(self, points: Array, t: float) -> Array:
         """Where the material points now at ``points`` [..., 3] were at t = 0, relative to the patch centre [mm]."""
         rotation, shift = self.pose(t)
-        return np.asarray(((points - shift) @ rotation - np.array(self.centre)) / self.size_at(t))
+        return np.asarray(((points - shift) @ rotation - np.array(self.centre)) @ np.linalg.inv(self.deformation(t)))
 
     def point_motion(self, points: Array) -> tuple[Array, Array]:
         """Velocity and acceleration at t = 0 of the material at points [..., 3] of the plane, growth included."""
         velocity, acceleration = super().point_motion(points)
-        spreading = self.growth * (points - np.array(self.centre))
+        spreading = (points - np.array(self.centre)) @ in_plane(self.zx, self.zy, self.strain_rates)
         return velocity + spreading, acceleration + 2.0 * np.cross(np.array(self.omega), spreading)
 
-    def texture(self, offsets: Array) -> Array:
+    def albedo(self, offsets: Array) -> Array:
         """Grey values [...] of the material points ``offsets`` [..., 3], without brightness changes."""
         pq = offsets @ plane_axes(self.zx, self.zy)
+        if self.texture == "noise":
+            shortest, longest = self.wavelengths_mm
+            period = max(NOISE_PERIOD * shortest, 4.0 * longest)
+            field = noise_texture((self.texture_seed,), period, shortest, longest)
+            return albedo(field, period, pq[..., 0], pq[..., 1], self.offset, self.amplitude)
         beta = self.alpha if self.beta is None else self.beta
         first = math.cos(self.alpha) * pq[..., 0] + math.sin(self.alpha) * pq[..., 1]
         second = math.cos(beta) * pq[..., 1] - math.sin(beta) * pq[..., 0]
@@ -142,11 +184,13 @@ class PlaneScene(RigidScene):
 def render_image(scene: PlaneScene, frame: int, row: int, col: int) -> Array:
     """One image [H, W] of the camera (row, col) at ``frame``; float64 grey values, exposed (noise, bit depth)."""
     camera, t = scene.camera_position(row, col), scene.time(frame)
-    offsets = scene.material(scene.intersect(scene.rays(), camera, t), t)
-    image = scene.texture(offsets)
-    if scene.brightness:
-        image = image * np.exp(scene.log_brightness(offsets, camera, t))
-    return scene.expose(image, frame, row, col)
+
+    def shade(x: Array, y: Array) -> Array:
+        offsets = scene.material(scene.intersect(rays_of(x, y), camera, t), t)
+        grey = scene.albedo(offsets)
+        return grey * np.exp(scene.log_brightness(offsets, camera, t)) if scene.brightness else grey
+
+    return scene.expose(scene.integrate(shade, scene.rays_per_axis), frame, row, col)
 
 
 def render(
@@ -164,9 +208,10 @@ def render(
 def truth(scene: PlaneScene) -> dict[str, Array]:
     """What the middle camera sees at the middle frame.
 
-    ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] = N + Ω × (X - Xr) + g (X - Xc) mm/frame, of the point
-    seen at the pixel; ``omega`` [3] rad/frame; ``acceleration`` [H, W, 3] = A + Ω × (Ω × (X - Xr)) + 2 g Ω × (X - Xc)
-    mm/frame²; ``flow`` [H, W, 2] px/frame; ``growth_rate`` [H, W] %/frame.
+    ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] = N + Ω × (X - Xr) + E (X - Xc) mm/frame, of the point
+    seen at the pixel; ``omega`` [3] rad/frame; ``acceleration`` [H, W, 3] = A + Ω × (Ω × (X - Xr)) + 2 Ω × E (X - Xc)
+    mm/frame²; ``flow`` [H, W, 2] px/frame; ``growth_rate`` [H, W] %/frame, of the area; ``strain_rate`` [H, W, 3]
+    %/frame, of lengths: 11, 22 and 12 along ``tangent_axes``.
     """
     points = scene.intersect(scene.rays(), np.zeros(3), 0.0)
     velocity, acceleration = scene.point_motion(points)
@@ -179,6 +224,7 @@ def truth(scene: PlaneScene) -> dict[str, Array]:
         "acceleration": acceleration,
         "flow": scene.image_motion(points, velocity),
         "growth_rate": np.full(points.shape[:2], scene.growth_rate),
+        "strain_rate": np.broadcast_to(100.0 * scene.strain_rates, points.shape).copy(),
     }
 
 
@@ -213,3 +259,8 @@ def sinusoid_scene(noise: float = 0.0, size: tuple[int, int] = (161, 161), bits:
         omega=(ox, oy, oz),
         wavelengths_mm=(0.3, 0.3),
     )
+
+
+def noise_scene(size: tuple[int, int] = (161, 161)) -> PlaneScene:
+    """The plane of ``sinusoid_scene`` with noise of the same contrast: a texture that does not repeat itself."""
+    return replace(sinusoid_scene(size=size), texture="noise", amplitude=25.0, wavelengths_mm=(0.25, 1.0))

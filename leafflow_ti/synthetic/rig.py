@@ -18,6 +18,9 @@ from leafflow_ti.synthetic.geometry import Array
 Vector = tuple[float, float, float]
 BIT_DEPTHS = (8, 10, 12, 14, 16)
 
+BLOCK_ROWS = 8
+"""Image rows shaded at once: the arrays of a block stay in the processor's cache."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraGrid:
@@ -89,8 +92,21 @@ class CameraGrid:
 
     def rays(self) -> Array:
         """Viewing rays ``(x/f, y/f, 1)`` through the pixel centres, [H, W, 3]."""
-        x, y = self.ray_axes()
-        return np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1)
+        return rays_of(*self.ray_axes())
+
+    def integrate(self, shade: Callable[[Array, Array], Array], oversampling: int) -> Array:
+        """The image [H, W] of ``shade``, averaged over ``oversampling``² rays in each pixel; grey values, unexposed.
+
+        ``shade(x, y)`` gives the grey values [h, w] of the rays ``(x, y, 1)``, x [w], y [h], a few rows at a time.
+        """
+        x, y = self.ray_axes(oversampling)
+        width, height = self.size
+        image = np.empty((height, width))
+        for top in range(0, height, BLOCK_ROWS):
+            rows = slice(top, min(top + BLOCK_ROWS, height))
+            fine = shade(x, y[rows.start * oversampling : rows.stop * oversampling])
+            image[rows] = fine.reshape(-1, oversampling, width, oversampling).mean(axis=(1, 3))
+        return image
 
     def expose(self, image: Array, frame: int, row: int, col: int) -> Array:
         """Add the sensor's noise, then round and clip to its bit depth; float64 in any case.
@@ -103,6 +119,11 @@ class CameraGrid:
         if self.bits is not None:
             image = np.clip(np.rint(2.0 ** (self.bits - 8) * image), 0.0, 2.0**self.bits - 1.0)
         return image
+
+
+def rays_of(x: Array, y: Array) -> Array:
+    """The rays ``(x, y, 1)`` [h, w, 3] of every pair of x [w] and y [h]."""
+    return np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1)
 
 
 def render_grid(

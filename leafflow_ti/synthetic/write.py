@@ -13,12 +13,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from leafflow_ti.errors import RunError, UsageError
-from leafflow_ti.synthetic import cube, plane
-from leafflow_ti.synthetic.cube import CubeScene
 from leafflow_ti.synthetic.geometry import Array
-from leafflow_ti.synthetic.plane import PlaneScene
-
-Scene = PlaneScene | CubeScene
+from leafflow_ti.synthetic.scene import Scene, render_image, truth
 
 CAPTURE_FILE = "capture.toml"
 TRUTH_FILE = "truth.npz"
@@ -62,7 +58,7 @@ def _write_images(scene: Scene, folder: Path, progress: Callable[[int, int], Non
     for done, (t, sy, sx) in enumerate(images, start=1):
         path = folder / pattern.format(t=t, sy=sy, sx=sx)
         path.parent.mkdir(exist_ok=True)
-        tifffile.imwrite(path, _stored(scene, _image(scene, t, sy, sx)))
+        tifffile.imwrite(path, _stored(scene, render_image(scene, t, sy, sx)))
         if progress is not None:
             progress(done, len(images))
 
@@ -94,20 +90,13 @@ def capture_text(scene: Scene, interval_s: float | None = None) -> str:
 
 def truth_arrays(scene: Scene) -> dict[str, Any]:
     """All arrays of ``truth.npz``."""
-    maps = plane.truth(scene) if isinstance(scene, PlaneScene) else cube.truth(scene)
     return {
-        **maps,
+        **truth(scene),
         "frame": np.array(scene.reference_frame),
         "f_px": np.array(scene.f_px),
         "baseline_mm": np.array(scene.baseline_mm),
         "principal": np.array(scene.principal),
     }
-
-
-def _image(scene: Scene, t: int, sy: int, sx: int) -> Array:
-    if isinstance(scene, PlaneScene):
-        return plane.render_image(scene, t, sy, sx)
-    return cube.render_image(scene, t, sy, sx)
 
 
 def _stored(scene: Scene, image: Array) -> NDArray[np.generic]:

@@ -54,19 +54,15 @@ def rotation(degrees: float) -> tuple[float, float, float]:
 
 @lru_cache(maxsize=2)
 def _clean(scene: Scene) -> Array:
-    images = plane.render(scene) if isinstance(scene, PlaneScene) else cube.render(scene)
-    return images.astype(np.uint8) if scene.bits == 8 else images
+    return plane.render(scene) if isinstance(scene, PlaneScene) else cube.render(scene)
 
 
 def capture(scene: Scene, seed: int) -> Capture:
-    """The images of a scene. Real numbers are rendered without noise once; every seed adds its own."""
-    if scene.bits is None:
-        images = _clean(replace(scene, noise=0.0, seed=0))
-        if scene.noise > 0.0:
-            noisy = replace(scene, seed=seed)
-            images = np.stack([noisy.expose(image, *at) for at, image in _each(images)]).reshape(images.shape)
-    else:
-        images = _clean(replace(scene, seed=seed) if scene.noise > 0.0 else scene)
+    """The images of a scene, rendered once without noise and real; every seed exposes them with its own."""
+    clean, exposed = _clean(replace(scene, noise=0.0, seed=0, bits=None)), replace(scene, seed=seed)
+    images = np.stack([exposed.expose(image, *at) for at, image in _each(clean)]).reshape(clean.shape)
+    if scene.bits == 8:
+        images = images.astype(np.uint8)
     step = (scene.baseline_mm[0], scene.baseline_mm[1] if scene.n_rows > 1 else 0.0)
     return capture_from_array(images, Geometry(scene.f_px, scene.principal, step), bits=scene.bits)
 
@@ -80,13 +76,12 @@ def _truth(scene: Scene) -> Mapping[str, Array]:
     found = cube.truth(scene) if isinstance(scene, CubeScene) else plane.truth(scene) | brightness(scene)
     known = np.isfinite(found["depth"])
     found["omega"] = np.where(known[..., None], found["omega"], np.nan)
-    found["growth_rate"] = np.where(known, 0.0, np.nan)
     return found
 
 
 def truth(scene: Scene) -> Mapping[str, Array]:
-    """Maps [H, W, ...] of what the reference camera sees: those of ``metrics``, no growth, and the brightness of a
-    plane by the names of the results."""
+    """Maps [H, W, ...] of what the reference camera sees: those of ``metrics``, and the brightness of a plane by the
+    names of the results."""
     return _truth(replace(scene, noise=0.0))
 
 
