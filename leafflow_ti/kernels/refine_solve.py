@@ -35,6 +35,8 @@ DRIFT = 0.05
 """Pixels that the warps may move before the images are sampled anew."""
 OUTLYING = 16.0
 """Mean squared residual of an image, against the typical one, beyond which it is trusted less."""
+TOLERATED = 0.03
+"""Pixels of misplacement whose residual is no reason to trust an image or a sample less."""
 TUKEY = 6.0
 """Standard deviations beyond which a sample has no weight."""
 CONVERGED = 0.01
@@ -128,6 +130,13 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
                 P[slot.precise + size[Size.GAIN_STEP] + m * groups + g] = V(0.0)
 
     @ti.func
+    def tolerated(slot: ti.template(), size: ti.template(), p: ti.template()):
+        """Mean squared residual of a texture that is slightly misplaced."""
+        s = scalars(slot, size)
+        gradient = p[s + Scalar.GRAM] + p[s + Scalar.GRAM + FUNCTIONS + 1]
+        return 0.5 * TOLERATED * TOLERATED * gradient / ti.max(p[s + Scalar.MASS], precise(1e-30))
+
+    @ti.func
     def weigh(slot: ti.template(), size: ti.template(), image: ti.template(), P: ti.template(), p: ti.template()):
         """Cost of the pass, and the weights of the images from their residuals, against the harmonic mean of these."""
         s, groups = scalars(slot, size), size[Size.IMAGE_GROUPS]
@@ -143,7 +152,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             counted += total(some)
         p[s + Scalar.COST] = energy / ti.max(mass, precise(1e-30))
         p[s + Scalar.IMAGES] = mass / ti.max(whole, precise(1e-30))
-        typical = counted / ti.max(inverse, precise(1e-30))
+        typical = ti.max(counted / ti.max(inverse, precise(1e-30)), tolerated(slot, size, p))
         for g in range(groups):
             e, m = P[slot.precise + size[Size.ENERGY] + g], P[slot.precise + size[Size.MASS] + g]
             bound = V(OUTLYING * typical) * m / ti.max(e, V(1e-30))
@@ -392,7 +401,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
                 error = cost * value[Value.CORRELATION] * ti.cast(size[Size.UNKNOWNS], precise)
                 if p[s + Scalar.LAST] > ti.max(LAST_STEP * error, CONTRACTED * p[s + Scalar.FIRST]):
                     p[s + Scalar.CODE] = not_converged
-        p[s + Scalar.ROBUST] = TUKEY * TUKEY * cost
+        p[s + Scalar.ROBUST] = TUKEY * TUKEY * ti.max(cost, tolerated(slot, size, p))
         p[s + Scalar.RESAMPLE] = precise(0.0)
         if p[s + Scalar.DRIFT] > DRIFT:
             p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
