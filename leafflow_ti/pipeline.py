@@ -206,7 +206,10 @@ class Pipeline:
             engine.refine.set_mask(self._reader.masked(wide))
         margin = engine.prefilter.radius if engine.prefilter else 0
         place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
-        within = slice(engine.widening, engine.widening + inner.rows), slice(engine.widening, engine.widening + inner.cols)
+        within = (
+            slice(engine.widening, engine.widening + inner.rows),
+            slice(engine.widening, engine.widening + inner.cols),
+        )
         return _Stay(engine, wide.widened(margin), wide, within, self._reader.inside(inner), place, centre)
 
     def read_alone(self, index: int, frames: range) -> dict[str, float]:

@@ -117,9 +117,7 @@ def transferred(parameters: Array, seen: Array, wanted: Array) -> Array:
     return result
 
 
-def _derived(
-    plan: Refinement, q: Array, covariance: Array, rays: Array, f: float
-) -> dict[str, tuple[Array, Array]]:
+def _derived(plan: Refinement, q: Array, covariance: Array, rays: Array, f: float) -> dict[str, tuple[Array, Array]]:
     """Maps and standard errors [n] from parameters [n, 15] and their covariance."""
 
     def linear(gradient: dict[int, Array | float]) -> Array:

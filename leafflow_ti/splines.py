@@ -6,8 +6,10 @@ The basis function has the support -3..3; between two pixels a point ``u`` behin
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -29,13 +31,12 @@ def spline_pieces() -> Array:
     Neighbour m lies ``m - 2`` pixels behind the pixel left of the point.
     """
     # Cardinal splines of support 0..n+1, piece by piece: n β_n(x) = x β_(n-1)(x) + (n + 1 - x) β_(n-1)(x - 1).
-    pieces = [np.polynomial.Polynomial([1.0])]
+    pieces = [Polynomial([1.0])]
     for n in range(1, DEGREE + 1):
-        padded = [np.polynomial.Polynomial([0.0]), *pieces, np.polynomial.Polynomial([0.0])]
+        padded = [Polynomial([0.0]), *pieces, Polynomial([0.0])]
         pieces = [
-            (np.polynomial.Polynomial([j, 1]) * padded[j + 1] + np.polynomial.Polynomial([n + 1 - j, -1]) * padded[j]) / n
-            for j in range(n + 1)
-        ]  # fmt: skip
+            (Polynomial([j, 1]) * padded[j + 1] + Polynomial([n + 1 - j, -1]) * padded[j]) / n for j in range(n + 1)
+        ]
     found = np.zeros((3, DEGREE + 1, DEGREE + 1))
     for m, piece in enumerate(reversed(pieces)):
         for d in range(3):
@@ -45,7 +46,7 @@ def spline_pieces() -> Array:
     return found
 
 
-def spline(u: Array) -> Array:
+def spline(u: NDArray[Any]) -> Array:
     """The basis function at ``u`` px from its centre."""
     inside = (u > -SUPPORT) & (u < SUPPORT)
     left = np.floor(u)

@@ -1,7 +1,7 @@
 """The refinement of single output pixels on the exact moving patch: Gauss-Newton on the grey values of all images.
 
-On the CPU a task takes a pixel through all its steps, so that its workspace stays in the cache. On a GPU every stage is a
-launch, and a thread one vector of samples, one image, or one pixel, whichever the stage can be divided by.
+On the CPU a task takes a pixel through all its steps, so that its workspace stays in the cache. On a GPU every stage
+is a launch, and a thread one vector of samples, one image, or one pixel, whichever the stage can be divided by.
 """
 
 import functools

@@ -2,8 +2,8 @@
 
     V_k(δ) = g_k(δ) (T(δ) + blur_k · (Txx, Txy, Tyy))        g_k = 1 + Σ a_k,m φ_m(δ)
 
-Images are interpolated by quintic B-splines. What smooths an image (the area of a pixel, the prefilter) is isotropic there,
-so images in which the surface looks narrower show it smoother along that direction: to first order by the second
+Images are interpolated by quintic B-splines. What smooths an image (the area of a pixel, the prefilter) is isotropic
+there, so images in which the surface looks narrower show it smoother along that direction: to first order by the second
 derivatives of the texture, with weights that follow from the warps (``Warp.BLUR``).
 """
 
@@ -76,7 +76,7 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def position(at: ti.i32, x: ti.template(), y: ti.template(), along: ti.i32, r: ti.template()):
-        """Where the homography at ``at`` puts the window points (x, y), from the block's centre, along x (0) or y (1)."""
+        """Where the homography at ``at`` puts window points, from the block's centre: along x (0) or y (1)."""
         depth = 1.0 / (r[at + 6] * x + r[at + 7] * y + 1.0)
         return (r[at + 3 * along] * x + r[at + 3 * along + 1] * y + r[at + 3 * along + 2]) * depth
 
@@ -294,9 +294,9 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
         for j in range(i + 1):
             found = V(0.0)
             for n in range(groups):
-                found = found + S[first + i * groups + n] * S[first + j * groups + n] * S[
-                    slot.real + size[Size.WEIGHT] + n
-                ]
+                found = (
+                    found + S[first + i * groups + n] * S[first + j * groups + n] * S[slot.real + size[Size.WEIGHT] + n]
+                )
             element = ti.cast(total(found), precise)
             p[s + Scalar.GRAM + i * FUNCTIONS + j] = element
             p[s + Scalar.GRAM + j * FUNCTIONS + i] = element

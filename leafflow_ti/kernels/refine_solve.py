@@ -1,7 +1,7 @@
 """Normal equations of a pixel from the sums of its images, the step, and the covariance at the end.
 
-With C_k [8, n] what the unknowns do to the functions B of the window, and the texture eliminated, the Jacobian of image k
-is ``g_k B^T (C_k - mean C)``; without what the photometric terms ``T φ`` explain,
+With C_k [8, n] what the unknowns do to the functions B of the window, and the texture eliminated, the Jacobian of
+image k is ``g_k B^T (C_k - mean C)``; without what the photometric terms ``T φ`` explain,
 
     H = Σ_k ω_k (C_k - mean C)^T (G - X M^-1 X^T) (C_k - mean C),   G = Σ w B B^T, X = Σ w B Tφ^T, M = Σ w Tφ Tφ^T
 
@@ -30,7 +30,7 @@ from leafflow_ti.kernels.spec import KernelSpec
 LONGEST_STEP = 1.0
 """Pixels that a step may move anything in the window of any image."""
 RISE = 1.02
-"""Factor by which a step may raise the cost: near the end the direction is that of noise, and of what is approximated."""
+"""Factor by which a step may raise the cost: near the end its direction is that of what is approximated."""
 DRIFT = 0.05
 """Pixels that the warps may move before the images are sampled anew."""
 OUTLYING = 16.0
@@ -202,7 +202,9 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
                 P[at + g] = P[at + g] - average
 
     @ti.func
-    def normal_equations(slot: ti.template(), metric: ti.i32, squared: ti.i32, size: ti.template(), P: ti.template(), p: ti.template()):
+    def normal_equations(
+        slot: ti.template(), metric: ti.i32, squared: ti.i32, size: ti.template(), P: ti.template(), p: ti.template()
+    ):
         """Packed ``Σ ω C^T metric C`` into NORMAL; with ω² where ``squared``."""
         s, n, groups = scalars(slot, size), size[Size.UNKNOWNS], size[Size.IMAGE_GROUPS]
         whole = p[s + Scalar.MASS]
@@ -433,7 +435,9 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
                 p[s + Scalar.NORMAL + j * n + i] = element
         images = p[s + Scalar.IMAGES]
         # The texture takes one image's worth of residuals, the photometric terms a few samples' of each.
-        left = (1.0 - 1.0 / images) * ti.max(1.0 - ti.cast(size[Size.TERMS], precise) / p[s + Scalar.EFFECTIVE], precise(0.1))
+        left = (1.0 - 1.0 / images) * ti.max(
+            1.0 - ti.cast(size[Size.TERMS], precise) / p[s + Scalar.EFFECTIVE], precise(0.1)
+        )
         variance = p[s + Scalar.COST] / left
         for i in range(n):
             for j in range(n):

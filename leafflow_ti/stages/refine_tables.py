@@ -1,0 +1,129 @@
+"""Tables of the refinement's kernels: window, images, camera, splines, noise, and how a workspace is laid out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.refine_plan import PIXEL_VARIANCE, Refinement
+from leafflow_ti.splines import FILTER_RADIUS, PREFILTER_SIGMA, SUPPORT, filter_taps, spline, spline_pieces
+from leafflow_ti.stages.estimate_tables import View
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class RefineTables:
+    """Tables of the kernels on the host, and the sizes of a pixel's workspaces in vectors."""
+
+    size: NDArray[np.int32]
+    value: Array
+    image: Array
+    sample: Array
+    slot_real: int
+    slot_precise: int
+
+    @classmethod
+    def of(cls, plan: Refinement, view: View, lanes: int, pitch: int, gpu: bool) -> RefineTables:
+        """For images at ``pitch`` and views with this camera.
+
+        ``lanes``: samples, or images, of a vector; ``gpu``: the warps of all images are made at once.
+        """
+        from leafflow_ti.kernels.refine_tables import (
+            DERIVATIVES,
+            FUNCTIONS,
+            SHIFTS,
+            TERMS,
+            Geometry,
+            Image,
+            Scalar,
+            Size,
+            Value,
+            Warp,
+        )  # fmt: skip
+
+        unknowns = _unknowns(plan)
+        n, k = len(unknowns), len(plan.frames) * len(plan.cameras)
+        images = -(-k // lanes)
+        offsets = plan.thin * (np.arange(plan.across) - plan.across // 2)
+        n_samples = plan.across**2
+        groups = -(-n_samples // lanes)
+        size = np.zeros(Size.LIST + n, np.int32)
+        size[Size.LIST :] = unknowns
+        correlation = _noise_correlation(plan.thin)
+        for name, entry in {
+            Size.UNKNOWNS: n, Size.MODES: plan.modes, Size.TERMS: plan.terms, Size.IMAGES: k,
+            Size.IMAGE_GROUPS: images, Size.SAMPLES: n_samples, Size.SAMPLE_GROUPS: groups, Size.ACROSS: plan.across,
+            Size.STEPS: plan.steps, Size.PITCH: pitch, Size.NEIGHBOURS: len(correlation) - 1,
+        }.items():  # fmt: skip
+            size[name] = entry
+        warps = -(-k * Warp.N // lanes)
+        slot_real = _lay_out(size, {
+            Size.SEEN: DERIVATIVES * k * groups, Size.VALUES: k * groups, Size.TEXTURE: groups, Size.BEFORE: groups,
+            Size.FUNCTION: FUNCTIONS * groups, Size.BLUR: 3 * groups, Size.WEIGHT: groups, Size.SCRATCH: 2 * SHIFTS * groups, Size.WARP: warps,
+        })  # fmt: skip
+        slot_precise = _lay_out(size, {
+            Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
+            Size.TRUST: images, Size.GAIN: TERMS * images, Size.GAIN_STEP: TERMS * images,
+            Size.HOMOGRAPHY: Warp.GAIN * images, Size.PRODUCT: SHIFTS, Size.NORMAL: n * (n + 1) // 2, Size.RIGHT: n,
+            Size.SCALAR: -(-Scalar.N // lanes), Size.GEOMETRY: Geometry.N * (images if gpu else 1),
+        })  # fmt: skip
+        size[Size.SLOT_REAL], size[Size.SLOT_PRECISE] = slot_real, slot_precise
+
+        sample = np.zeros((3, groups * lanes))
+        sample[0, :n_samples], sample[1, :n_samples] = np.tile(offsets, plan.across), np.repeat(offsets, plan.across)
+        weights = np.exp(-0.5 * (sample[0, :n_samples] ** 2 + sample[1, :n_samples] ** 2) / plan.sigma**2)
+        sample[2, :n_samples] = weights / weights.sum()
+
+        image = np.zeros((Image.N, images * lanes))
+        steps = np.array(plan.cameras, float)
+        image[Image.PRESENT, :k] = 1
+        image[Image.TIME, :k] = np.repeat(plan.frames, len(steps))
+        for axis in range(2):
+            image[Image.CAMERA_X + axis, :k] = np.tile(steps[:, axis] * view.baseline_mm[axis], len(plan.frames))
+            image[Image.SHIFT_X + axis, :k] = np.tile(steps[:, axis] * view.shift_px[axis], len(plan.frames))
+
+        value = np.zeros(Value.CORRELATION_AT + len(correlation))
+        value[Value.FOCAL], value[Value.HALF] = view.f_px, plan.size / 2
+        value[Value.SMOOTHING] = 0.5 * (PIXEL_VARIANCE + PREFILTER_SIGMA**2)
+        value[Value.LIMIT] = plan.size // 2 + plan.reach
+        both = 2 * correlation.sum() - 1
+        value[Value.CORRELATION] = both**2 * np.sum(sample[2] ** 2) / np.sum(sample[2])
+        value[Value.SPLINE : Value.CORRELATION_AT] = spline_pieces().ravel()
+        value[Value.CORRELATION_AT :] = correlation
+        return cls(size, value, image, sample, slot_real, slot_precise)
+
+
+def _unknowns(plan: Refinement) -> list[int]:
+    """Which of the fifteen parameters are estimated."""
+    from leafflow_ti.kernels.refine_tables import GROWTH
+
+    return [*range(3 + plan.motion), *range(GROWTH, GROWTH + plan.modes)]
+
+
+def _lay_out(size: NDArray[np.int32], lengths: dict[Any, int]) -> int:
+    """Put regions behind one another, their first elements into ``size``; the length of all."""
+    at = 0
+    for name, length in lengths.items():
+        size[name] = at
+        at += length
+    return at
+
+
+def _noise_correlation(thin: int) -> Array:
+    """Correlation of the noise of warped images at 0, ``thin``, 2 ``thin``, ... px, until it is below 1e-3.
+
+    White noise that is filtered and interpolated at positions that fall anywhere between the pixels has, on average,
+    the autocorrelation of the cardinal spline of the filter.
+    """
+    fine = 32
+    taps = filter_taps()
+    radius = FILTER_RADIUS + SUPPORT
+    u = np.arange(-radius * fine, radius * fine + 1) / fine
+    impulse = np.sum([tap * spline(u - r) for r, tap in enumerate(taps, -FILTER_RADIUS)], axis=0)
+    found = np.correlate(impulse, impulse, "full")
+    found = found[len(u) - 1 :: thin * fine] / found[len(u) - 1]
+    return np.asarray(found[: int(np.flatnonzero(np.abs(found) > 1e-3).max()) + 1])
