@@ -7,35 +7,44 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter1d
+from scipy.interpolate import BSpline
+from scipy.ndimage import gaussian_filter, spline_filter1d
 
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import load_config
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.plan import Plan, make_plan
-from leafflow_ti.refine_plan import FILTER_RADIUS, LEAST_TAP, PREFILTER_SIGMA, Refinement, filter_taps
+from leafflow_ti.refine_plan import Refinement
+from leafflow_ti.splines import LEAST_TAP, PREFILTER_SIGMA, filter_radius, filter_taps, spline, spline_pieces, support
 
 
-def test_filter_is_a_gaussian_and_the_splines_own() -> None:
-    """Against SciPy's recursive filter; what is cut off are taps below 1e-7 of the largest."""
-    taps = filter_taps()
-    assert len(taps) == 2 * FILTER_RADIUS + 1
+@pytest.mark.parametrize("degree", [5, 7])
+def test_filter_is_a_gaussian_and_the_splines_own(degree: int) -> None:
+    """Its coefficients, at the pixels, are the smoothed image; what is cut off are taps below 1e-7 of the largest."""
+    taps = filter_taps(degree)
+    assert len(taps) == 2 * filter_radius(degree) + 1
     np.testing.assert_array_equal(taps, taps[::-1])
     assert taps.sum() == pytest.approx(1, abs=1e-15)
     assert np.abs(taps).min() >= LEAST_TAP * taps.max()
     row = np.random.default_rng(0).uniform(0, 255, 200)
-    wanted = spline_filter1d(gaussian_filter(row, PREFILTER_SIGMA, truncate=8, mode="mirror"), 3, mode="mirror")
-    # Twice the first tap left out, .27 of the last, and the geometric tail behind it; far from the ends.
+    smooth = gaussian_filter(row, PREFILTER_SIGMA, truncate=8, mode="mirror")
+    there = np.convolve(np.convolve(row, taps, "same"), spline(np.arange(-3.0, 4.0), degree), "same")
+    # Twice the first tap left out, .54 of the last, and the geometric tail behind it; far from the ends.
     inner = slice(60, -60)
-    np.testing.assert_allclose(np.convolve(row, taps, "same")[inner], wanted[inner], atol=255 * 1e-7)
+    np.testing.assert_allclose(there[inner], smooth[inner], atol=255 * 4e-7)
+    if degree == 5:
+        wanted = spline_filter1d(smooth, degree, mode="mirror")
+        np.testing.assert_allclose(np.convolve(row, taps, "same")[inner], wanted[inner], atol=255 * 4e-7)
 
 
-def test_spline_of_the_coefficients_is_the_smoothed_image() -> None:
-    row = np.random.default_rng(1).uniform(0, 255, 200)
-    coefficients = np.convolve(row, filter_taps(), "same")
-    at = np.arange(60, 140)
-    found = map_coordinates(coefficients, at[None], order=3, prefilter=False, mode="mirror")
-    np.testing.assert_allclose(found, gaussian_filter(row, PREFILTER_SIGMA, truncate=8)[at], atol=255 * 1e-7)
+@pytest.mark.parametrize("degree", [5, 7])
+def test_pieces_are_the_basis_functions(degree: int) -> None:
+    u, reach = 0.3, support(degree)
+    basis = BSpline.basis_element(np.arange(degree + 2.0) - (degree + 1) / 2, extrapolate=False)
+    for d in range(3):
+        weights = spline_pieces(degree)[d] @ u ** np.arange(degree + 1)
+        wanted = [basis.derivative(d)(u - m - 1 + reach) if d else basis(u - m - 1 + reach) for m in range(degree + 1)]
+        np.testing.assert_allclose(weights, wanted, atol=1e-14)
 
 
 def capture(frames: int = 9, rows: int = 1, cols: int = 9, size: tuple[int, int] = (96, 128)) -> Capture:
@@ -62,7 +71,7 @@ def test_default_is_refined_with_all_images_of_the_window() -> None:
     assert (found.motion, found.modes, found.terms, found.unknowns) == (9, 1, 0, 13)
     # Half the window; four camera steps, two pixels for each of four frames, four besides; the spline and its filter.
     assert found.reach == 4 + 2 * 4 + 4
-    assert found.halo == 16 + found.reach + 2 + FILTER_RADIUS
+    assert found.halo == 16 + found.reach + 3 + filter_radius(5)
 
 
 def test_cameras_stand_in_the_order_of_the_block() -> None:
