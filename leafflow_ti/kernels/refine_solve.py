@@ -137,6 +137,21 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
         return 0.5 * TOLERATED * TOLERATED * gradient / ti.max(p[s + Scalar.MASS], precise(1e-30))
 
     @ti.func
+    def plain_variance(weighted: precise, limit: precise) -> precise:
+        """Variance of normal residuals whose mean square under Tukey's weights is ``weighted``."""
+        found = weighted
+        if limit > 0.0:
+            for _ in range(4):
+                # Expectations of z² m and of m, m = (1 - z²/c²)², c far outside.
+                inverse = ti.min(found / limit, precise(0.1))
+                found = (
+                    weighted
+                    * (1.0 - 2.0 * inverse + 3.0 * inverse * inverse)
+                    / (1.0 - 6.0 * inverse + 15.0 * inverse * inverse)
+                )
+        return found
+
+    @ti.func
     def weigh(slot: ti.template(), size: ti.template(), image: ti.template(), P: ti.template(), p: ti.template()):
         """Cost of the pass, and the weights of the images from their residuals, against the harmonic mean of these."""
         s, groups = scalars(slot, size), size[Size.IMAGE_GROUPS]
@@ -150,7 +165,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             some = ti.select(m > V(0.1 * whole), V(1.0), V(0.0))
             inverse += total(some * m / ti.max(e, V(1e-30)))
             counted += total(some)
-        p[s + Scalar.COST] = energy / ti.max(mass, precise(1e-30))
+        p[s + Scalar.COST] = plain_variance(energy / ti.max(mass, precise(1e-30)), p[s + Scalar.ROBUST])
         p[s + Scalar.IMAGES] = mass / ti.max(whole, precise(1e-30))
         typical = ti.max(counted / ti.max(inverse, precise(1e-30)), tolerated(slot, size, p))
         for g in range(groups):

@@ -63,7 +63,8 @@ class RefineTables:
         warps = -(-k * Warp.N // lanes)
         slot_real = _lay_out(size, {
             Size.SEEN: DERIVATIVES * k * groups, Size.VALUES: k * groups, Size.TEXTURE: groups, Size.BEFORE: groups,
-            Size.FUNCTION: FUNCTIONS * groups, Size.BLUR: 3 * groups, Size.WEIGHT: groups, Size.SCRATCH: 2 * SHIFTS * groups, Size.WARP: warps,
+            Size.FUNCTION: FUNCTIONS * groups, Size.BLUR: 3 * groups, Size.WEIGHT: groups,
+            Size.SCRATCH: 2 * SHIFTS * groups, Size.WARP: warps,
         })  # fmt: skip
         slot_precise = _lay_out(size, {
             Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
