@@ -86,7 +86,8 @@ class Geometry(IntEnum):
     INVERSE = 33  # [3, 3]
     GAMMA = 42  # [3]
     PLAIN = 45  # [3, 2]: columns before they are turned
-    N = 51
+    TRACK = 51  # [3, 3]: what the acceleration moves the patch by, in t²/2
+    N = 60
 
 
 class Image(IntEnum):

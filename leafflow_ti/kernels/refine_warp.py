@@ -1,10 +1,12 @@
 """Where the images see a moving patch, and what a change of its parameters does to that.
 
 A window point δ [px] of the reference image is the point ``P(δ) = Z(δ) r - C`` of a plane through ``C = Z0 r0``, and at
-time t it is at ``X = C + N t + A t²/2 + R(Ω t) G(t) P``. With ``ρ = 1 / Z(δ)``, which is linear in δ,
+time t it is at ``X = C + N t + V(Ω t) A t²/2 + R(Ω t) G(t) P``. The acceleration turns with the patch, V = 1 + K/3 +
+K²/12 + ... with K the cross product by Ω t: so the path is exact for a turn about any axis, and without V the jerk
+of a turn would be taken for velocity. With ``ρ = 1 / Z(δ)``, which is linear in δ,
 
     P ρ = L δ,   L = [e_x/f + r0 η_x, e_y/f + r0 η_y],   η = (ZX, ZY) / (f (1 - ZX x0/f - ZY y0/f))
-    (X - s) ρ = R G L δ + γ (1 - η δ),   γ = r0 + (N t + A t²/2 - s) / Z0
+    (X - s) ρ = R G L δ + γ (1 - η δ),   γ = r0 + (N t + V A t²/2 - s) / Z0
 
 so every image is seen through a homography ``H = [R G L - γ η^T | γ]`` of (δ, 1), exactly.
 
@@ -105,7 +107,7 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def turn(g: ti.i32, t: ti.template(), s: ti.i32, P: ti.template(), p: ti.template()):
-        """Rotation by Ω t and its left Jacobian; power series are exact to 1e-9 for angles up to 1 rad."""
+        """Rotation by Ω t, its left Jacobian, and V; power series are exact to 1e-9 for angles up to 1 rad."""
         x, y, z = p[s + Scalar.Q + 6] * t, p[s + Scalar.Q + 7] * t, p[s + Scalar.Q + 8] * t
         a = x * x + y * y + z * z
         sine = 1.0 - a * (1.0 - a * (1.0 - a * (1.0 - a / 72.0) / 42.0) / 20.0) / 6.0
@@ -113,6 +115,8 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
         third = (1.0 - a * (1.0 - a * (1.0 - a * (1.0 - a / 110.0) / 72.0) / 42.0) / 20.0) / 6.0
         power_series(g + Geometry.R, sine, cosine, x, y, z, P)
         power_series(g + Geometry.TURN, cosine, third, x, y, z, P)
+        fourth = (1.0 - a * (1.0 - a * (1.0 - a / 90.0) / 56.0) / 30.0) / 24.0
+        power_series(g + Geometry.TRACK, 2.0 * third, 2.0 * fourth, x, y, z, P)
 
     @ti.func
     def rank_one(
@@ -135,19 +139,18 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def two_columns(to: ti.i32, step: ti.i32, g: ti.i32, t: ti.template(), P: ti.template()):
-        """The change whose first two columns are t times those at PLAIN; the third is 0."""
+        """Add the change whose first two columns are t times those at PLAIN; the third is 0."""
         for c in range(2):
             q = g + Geometry.PLAIN + c
             q0, q1, q2 = t * P[q], t * P[q + 2], t * P[q + 4]
-            P[to + c * step] = V(0.0)
             for r in range(3):
                 h = g + Geometry.INVERSE + 3 * r
                 moved = P[h] * q0 + P[h + 1] * q1 + P[h + 2] * q2
                 # ξ00, ξ01, ξ10, ξ11 are coefficients 2 to 5; -ξ20, -ξ21 the last two.
                 if r < 2:
-                    P[to + (2 + 2 * r + c) * step] = moved
+                    P[to + (2 + 2 * r + c) * step] = P[to + (2 + 2 * r + c) * step] + moved
                 else:
-                    P[to + (6 + c) * step] = 0.0 - moved
+                    P[to + (6 + c) * step] = P[to + (6 + c) * step] - moved
 
     @ti.func
     def moves(
@@ -181,20 +184,30 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
                 c2 = (P[h + 6] * r0 + P[h + 7] * r1 + P[h + 8]) * size_now - P[g + Geometry.GAMMA + 2]
                 eta = s + Scalar.ETA + 2 * unknown
                 rank_one(to, step, g, c0, c1, c2, p[eta], p[eta + 1], precise(0.0), P)
-            elif unknown < 6 or (unknown >= 9 and unknown < GROWTH):
-                along = unknown % 3
-                far = t * near
-                if unknown >= 9:
-                    far = far * t * 0.5
+            elif unknown < 6:
                 c0, c1, c2 = zero, zero, zero
-                if along == 0:
-                    c0 = far
-                elif along == 1:
-                    c1 = far
+                if unknown == 3:
+                    c0 = t * near
+                elif unknown == 4:
+                    c1 = t * near
                 else:
-                    c2 = far
+                    c2 = t * near
                 rank_one(to, step, g, c0, c1, c2, ex, ey, one, P)
+            elif unknown >= 9 and unknown < GROWTH:
+                far, track = t * t * (0.5 * near), g + Geometry.TRACK + unknown - 9
+                rank_one(to, step, g, far * P[track], far * P[track + 3], far * P[track + 6], ex, ey, one, P)
             else:
+                # Turning the acceleration, e_i × A t³/6, and then the patch.
+                c0, c1, c2 = zero, zero, zero
+                if unknown < GROWTH:
+                    far, turned = t * t * t * (near / 6.0), s + Scalar.Q + 9
+                    if unknown == 6:
+                        c1, c2 = far * (0.0 - p[turned + 2]), far * p[turned + 1]
+                    elif unknown == 7:
+                        c0, c2 = far * p[turned + 2], far * (0.0 - p[turned])
+                    else:
+                        c0, c1 = far * (0.0 - p[turned + 1]), far * p[turned]
+                rank_one(to, step, g, c0, c1, c2, ex, ey, one, P)
                 for c in range(2):
                     for r in range(3):
                         plain = zero
@@ -233,7 +246,10 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
                 P[g + Geometry.ML + 2 * r + c] = total
         near = 1.0 / p[s + Scalar.Q]
         for r in range(3):
-            moved = t * p[s + Scalar.Q + 3 + r] + t * t * (0.5 * p[s + Scalar.Q + 9 + r])
+            moved = V(0.0)
+            for k in range(3):
+                moved = moved + P[g + Geometry.TRACK + 3 * r + k] * p[s + Scalar.Q + 9 + k]
+            moved = t * (0.5 * t * moved + p[s + Scalar.Q + 3 + r])
             if r < 2:
                 moved = moved - image[(Image.CAMERA_X + r) * groups + group]
             gamma = moved * near + p[s + Scalar.RAY + r]

@@ -5,8 +5,11 @@ An oracle: rays, planes and rotations, no flow equation and no expansion. With o
 and rays ``r = ((x0 + δx)/f, (y0 + δy)/f, 1)``,
 
     Z(δ) = (Z0 - ZX Cx - ZY Cy) / (1 - ZX rx - ZY ry)          C = Z0 (x0/f, y0/f, 1)
-    X(δ, t) = C + N t + A t²/2 + R(Ω t) (1 + t E) (Z(δ) r - C)
+    X(δ, t) = C + N t + V(Ω t) A t²/2 + R(Ω t) (1 + t E) (Z(δ) r - C)
     x_k = f (X - s_k) / X_z                                     camera k at s_k, frame t
+
+``V = 1 + K/3 + K²/12 + ...``, with K the cross product by Ω t, lets the acceleration turn with the patch: the path of a
+patch that turns about any axis is exact, and most accelerations come from that.
 """
 
 from __future__ import annotations
@@ -84,8 +87,21 @@ def warp(views: Views, state: Array, offsets: Array, k: int) -> Array:
     z = (depth - zx * centre[0] - zy * centre[1]) / (1.0 - zx * rays[:, 0] - zy * rays[:, 1])
     t = float(views.times[k])
     grown = (z[:, None] * rays - centre) @ (np.eye(3) + t * in_plane(zx, zy, strain))
-    points = centre + t * velocity + 0.5 * t * t * acceleration + grown @ rotation_matrix(t * omega).T
+    points = (
+        centre + t * velocity + 0.5 * t * t * (turning(t * omega) @ acceleration) + grown @ rotation_matrix(t * omega).T
+    )
     return np.asarray(views.f_px * (points[:, :2] - views.cameras[k]) / points[:, 2:])
+
+
+def turning(angle: Array) -> Array:
+    """``V`` [3, 3] for a rotation vector [rad]: twice the integral of (1 - s) R(s angle) over s from 0 to 1."""
+    x, y, z = angle
+    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    term, total = np.eye(3), np.eye(3)
+    for n in range(3, 15):
+        term = term @ k / n
+        total = total + term
+    return total
 
 
 def window_derivative(views: Views, state: Array, offsets: Array, k: int) -> Array:
