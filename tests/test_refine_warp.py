@@ -17,7 +17,7 @@ SCENE_OF_MANY = replace(SCENE, n_rows=2, n_cols=3, n_frames=5)
 
 
 def warps_of(device: Device, case: Case, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Homographies [K, 8] in pixels and moves [K, 8 functions, n] of all images at a state [15] as the kernels have it."""
+    """Homographies [K, 8] in pixels and moves [K, 8 functions, n] of all images at a state [15] as kernels have it."""
     from leafflow_ti.kernels.engine import lane_kernel, ti
     from leafflow_ti.kernels.refine_tables import SHIFTS, Image, Scalar, Size
     from leafflow_ti.kernels.refine_warp import Slot, warp_functions
@@ -87,7 +87,8 @@ def test_every_unknown_moves_the_warps_as_rays_do(
     """Central differences of relative steps of 1e-5 know a derivative to 1e-9 or so; round-off adds 1e-8 of a pixel.
 
     The kernels leave out how the tangents turn with the slopes: a surface that strains differently along them then
-    moves by twice the strain until then, times the turn and the distance from the pixel, at most.
+    moves by twice the strain until then, times the turn and the distance from the pixel, at most. And they take the
+    turn of the acceleration's path to its first order in the angle Ω t: the second moves it by A t²/2 Ω t t/6.
     """
     case = Case(SCENE_OF_MANY, modes=modes)
     state = general_state(strain)
@@ -105,6 +106,9 @@ def test_every_unknown_moves_the_warps_as_rays_do(
         np.testing.assert_allclose(seen, wanted, atol=1e-8)
         found, wanted = moved(moves[k], offsets), pulled_back(views, state, offsets, k, case.unknowns)
         for i in range(found.shape[2]):
-            left_out = 2 * max(map(abs, strain)) * abs(views.times[k]) * farthest if anisotropic and i in (1, 2) else 0
+            t = abs(views.times[k])
+            left_out = 2 * max(map(abs, strain)) * t * farthest if anisotropic and i in (1, 2) else 0
+            if i in (6, 7, 8):
+                left_out = np.linalg.norm(state[9:12]) * t**4 * np.linalg.norm(state[6:9]) / 12 * SCENE.f_px / state[0]
             limit = 1e-6 + 2e-6 * np.abs(wanted[..., i]).max() + left_out
             np.testing.assert_allclose(found[..., i], wanted[..., i], atol=limit, err_msg=f"{i} in {k}")
