@@ -29,6 +29,7 @@ class Stage(IntEnum):
     GRAM = auto()  # function
     SUMS = auto()  # image
     SOLVE = auto()  # pixel
+    HALVES = auto()  # image
     SPREAD = auto()  # shift
     NOISE = auto()  # shift
     FINISH = auto()  # pixel
@@ -74,6 +75,8 @@ def refine_kernel(spec: KernelSpec, stage: Stage | None = None):
             for i in range(size[Size.IMAGES]):
                 samples.sums(slot, i, size, value, sample, S, r, p)
             solver.solve(slot, size, value, image, P, p)
+        for i in range(size[Size.IMAGES]):
+            samples.halves(slot, i, size, value, sample, S, r, p)
         for i in range(SHIFTS):
             samples.spread_noise(slot, i, size, value, r, p)
         for i in range(SHIFTS):
@@ -93,6 +96,8 @@ def refine_kernel(spec: KernelSpec, stage: Stage | None = None):
             samples.window(slot, i, centre[pixel], size, sample, mask, S, r)
         elif ti.static(stage == Stage.MASSES):
             solver.masses(slot, size, r, p)
+        elif ti.static(stage == Stage.HALVES):
+            samples.halves(slot, i, size, value, sample, S, r, p)
         elif ti.static(stage == Stage.SPREAD):
             samples.spread_noise(slot, i, size, value, r, p)
         elif ti.static(stage == Stage.NOISE):

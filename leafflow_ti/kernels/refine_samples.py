@@ -232,6 +232,25 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
         S[to + 5 * groups] = found * uy * uy
 
     @ti.func
+    def residual(
+        slot: ti.template(), at: ti.i32, k: ti.i32, i: ti.i32, g: ti.template(), limit: real, size: ti.template(),
+        S: ti.template(), r: ti.template(),
+    ):  # fmt: skip
+        """Residual of image k at a vector of samples, and its weight."""
+        groups = size[Size.SAMPLE_GROUPS]
+        n = slot.real + size[Size.BLUR] + i
+        blur = r[at + Warp.BLUR] * S[n] + r[at + Warp.BLUR + 1] * S[n + groups]
+        blur = blur + r[at + Warp.BLUR + 2] * S[n + 2 * groups]
+        n = slot.real + size[Size.SCRATCH] + i
+        old = r[at + Warp.BLUR] * S[n] + r[at + Warp.BLUR + 1] * S[n + groups]
+        old = old + r[at + Warp.BLUR + 2] * S[n + 2 * groups]
+        seen = S[slot.real + size[Size.VALUES] + k * groups + i]
+        weight = weight_of(seen, g * (S[slot.real + size[Size.BEFORE] + i] + old), limit)
+        weight = weight * S[slot.real + size[Size.WEIGHT] + i]
+        off = seen - g * (S[slot.real + size[Size.TEXTURE] + i] + blur)
+        return ti.select(weight > V(0.0), off, V(0.0)), weight
+
+    @ti.func
     def sums(
         slot: ti.template(), k: ti.i32, size: ti.template(), value: ti.template(), sample: ti.template(),
         S: ti.template(), r: ti.template(), p: ti.template(),
@@ -246,17 +265,7 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
         for i in range(groups):
             ux, uy = sample[i] * half, sample[groups + i] * half
             g = gain(at, terms, ux, uy, r)
-            n = slot.real + size[Size.BLUR] + i
-            blur = r[at + Warp.BLUR] * S[n] + r[at + Warp.BLUR + 1] * S[n + groups]
-            blur = blur + r[at + Warp.BLUR + 2] * S[n + 2 * groups]
-            n = slot.real + size[Size.SCRATCH] + i
-            old = r[at + Warp.BLUR] * S[n] + r[at + Warp.BLUR + 1] * S[n + groups]
-            old = old + r[at + Warp.BLUR + 2] * S[n + 2 * groups]
-            seen = S[slot.real + size[Size.VALUES] + k * groups + i]
-            weight = weight_of(seen, g * (S[slot.real + size[Size.BEFORE] + i] + old), limit)
-            weight = weight * S[slot.real + size[Size.WEIGHT] + i]
-            off = seen - g * (S[slot.real + size[Size.TEXTURE] + i] + blur)
-            off = ti.select(weight > V(0.0), off, V(0.0))
+            off, weight = residual(slot, at, k, i, g, limit, size, S, r)
             mass = mass + weight
             off_w = off * weight
             energy = energy + off_w * off
@@ -285,6 +294,38 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
             p[to + n * step] = ti.cast(total(found[n]), precise)
         p[(slot.precise + size[Size.MASS]) * lanes + k] = ti.cast(total(mass), precise)
         p[(slot.precise + size[Size.ENERGY]) * lanes + k] = ti.cast(total(energy), precise)
+
+    @ti.func
+    def halves(
+        slot: ti.template(), k: ti.i32, size: ti.template(), value: ti.template(), sample: ti.template(),
+        S: ti.template(), r: ti.template(), p: ti.template(),
+    ):  # fmt: skip
+        """Of one image: the sums of the right half of the window less those of the left; below less above."""
+        groups, terms = size[Size.SAMPLE_GROUPS], size[Size.TERMS]
+        limit = ti.cast(p[scalars(slot, size) + Scalar.ROBUST], real)
+        half = 1.0 / ti.cast(value[Value.HALF], real)
+        at = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
+        to = (slot.precise + size[Size.HALVES]) * lanes + k
+        step = size[Size.IMAGE_GROUPS] * lanes
+        x0, x1, x2, x3, x4, x5, x6, x7 = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+        y0, y1, y2, y3, y4, y5, y6, y7 = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
+        for i in range(groups):
+            x, y = sample[i], sample[groups + i]
+            g = gain(at, terms, x * half, y * half, r)
+            off, weight = residual(slot, at, k, i, g, limit, size, S, r)
+            scaled = off * weight * g
+            across = ti.select(x > V(0.0), scaled, V(0.0)) - ti.select(x < V(0.0), scaled, V(0.0))
+            down = ti.select(y > V(0.0), scaled, V(0.0)) - ti.select(y < V(0.0), scaled, V(0.0))
+            n = slot.real + size[Size.FUNCTION] + i
+            f0, f1, f2, f3 = S[n], S[n + groups], S[n + 2 * groups], S[n + 3 * groups]
+            f4, f5, f6, f7 = S[n + 4 * groups], S[n + 5 * groups], S[n + 6 * groups], S[n + 7 * groups]
+            x0, x1, x2, x3 = x0 + across * f0, x1 + across * f1, x2 + across * f2, x3 + across * f3
+            x4, x5, x6, x7 = x4 + across * f4, x5 + across * f5, x6 + across * f6, x7 + across * f7
+            y0, y1, y2, y3 = y0 + down * f0, y1 + down * f1, y2 + down * f2, y3 + down * f3
+            y4, y5, y6, y7 = y4 + down * f4, y5 + down * f5, y6 + down * f6, y7 + down * f7
+        found = ti.static([x0, x1, x2, x3, x4, x5, x6, x7, y0, y1, y2, y3, y4, y5, y6, y7])
+        for n in ti.static(range(2 * SHIFTS)):
+            p[to + n * step] = ti.cast(total(found[n]), precise)
 
     @ti.func
     def gram(slot: ti.template(), i: ti.i32, size: ti.template(), S: ti.template(), p: ti.template()):
@@ -347,5 +388,6 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.NOISE + i * SHIFTS + j] = found
 
     return SimpleNamespace(
-        window=window, warp=warp, texture=texture, sums=sums, gram=gram, spread_noise=spread_noise, noise=noise
+        window=window, warp=warp, texture=texture, sums=sums, halves=halves, gram=gram, spread_noise=spread_noise,
+        noise=noise,
     )  # fmt: skip

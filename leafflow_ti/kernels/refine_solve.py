@@ -44,6 +44,9 @@ CONVERGED = 0.01
 LAST_STEP = 1.0
 """The same: how large the last of the allowed steps may be, unless it is much shorter than the first one."""
 CONTRACTED = 0.1
+DOUBTFUL = 4.0
+"""Mean square of how much the halves of the window contradict each other, in standard errors, beyond which error bars
+grow with it: the window then holds more than a plane in rigid motion, and its residual is not noise alone."""
 UNDETERMINED = 1e-9
 """Share of an unknown's column, squared, that the others must leave of it."""
 
@@ -424,6 +427,31 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
 
     @ti.func
+    def doubt(slot: ti.template(), variance: precise, size: ti.template(), P: ti.template(), p: ti.template()):
+        """Factor for the variances: 1, or how much the halves of the window contradict each other.
+
+        What one half says of an unknown more than the other has the variance of what both say together, the scaled
+        NORMAL of the noise.
+        """
+        s, n, groups = scalars(slot, size), size[Size.UNKNOWNS], size[Size.IMAGE_GROUPS]
+        worst = precise(0.0)
+        for half in range(2):
+            square = precise(0.0)
+            for i in range(n):
+                total_score = V(0.0)
+                for b in range(SHIFTS):
+                    moves = slot.precise + size[Size.MOVES] + (b * n + i) * groups
+                    sums = slot.precise + size[Size.HALVES] + (half * SHIFTS + b) * groups
+                    for g in range(groups):
+                        trust = P[slot.precise + size[Size.TRUST] + g]
+                        total_score = total_score + P[moves + g] * P[sums + g] * trust
+                score = total(total_score) * p[s + Scalar.SCALE + i]
+                expected = variance * ti.max(p[s + Scalar.NORMAL + i * n + i], precise(1e-30))
+                square += score * score / (expected * ti.cast(n, precise))
+            worst = ti.max(worst, square)
+        return ti.select(worst > DOUBTFUL, worst, precise(1.0))
+
+    @ti.func
     def finish(
         slot: ti.template(), pixel: ti.i32, size: ti.template(), P: ti.template(), p: ti.template(), out: ti.template()
     ):
@@ -454,6 +482,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             1.0 - ti.cast(size[Size.TERMS], precise) / p[s + Scalar.EFFECTIVE], precise(0.1)
         )
         variance = p[s + Scalar.COST] / left
+        variance *= doubt(slot, variance, size, P, p)
         for i in range(n):
             for j in range(n):
                 element = precise(0.0)

@@ -59,6 +59,7 @@ class Size(IntEnum):
     PRODUCT = auto()  # [SHIFTS]
     NORMAL = auto()  # packed [unknowns]: sums of normal equations
     RIGHT = auto()  # [unknowns]
+    HALVES = auto()  # [2, SHIFTS, groups]: right minus left, below minus above, of SUMS
     SCALAR = auto()  # numbers of the pixel, see Scalar
     GEOMETRY = auto()  # [Geometry.N]: what the warps of a vector of images are made of
     LIST = auto()  # [unknowns]: which of MAX_UNKNOWNS are estimated; the last entries

@@ -192,7 +192,7 @@ class RefineStage:
             Stage.WINDOW: size[Size.SAMPLE_GROUPS], Stage.PREPARE: size[Size.IMAGE_GROUPS],
             Stage.HAND_OVER: size[Size.IMAGES], Stage.WARP: size[Size.SAMPLE_GROUPS],
             Stage.TEXTURE: size[Size.SAMPLE_GROUPS], Stage.GRAM: FUNCTIONS,
-            Stage.SUMS: size[Size.IMAGES], Stage.SPREAD: SHIFTS, Stage.NOISE: SHIFTS,
+            Stage.SUMS: size[Size.IMAGES], Stage.HALVES: size[Size.IMAGES], Stage.SPREAD: SHIFTS, Stage.NOISE: SHIFTS,
         }  # fmt: skip
 
         def launch(stages: range) -> None:
@@ -201,8 +201,8 @@ class RefineStage:
 
         launch(range(Stage.BEGIN, Stage.AIM))
         for _ in range(self.plan.steps):
-            launch(range(Stage.AIM, Stage.SPREAD))
-        launch(range(Stage.SPREAD, Stage.FINISH + 1))
+            launch(range(Stage.AIM, Stage.HALVES))
+        launch(range(Stage.HALVES, Stage.FINISH + 1))
 
 
 def _filters(device: Device, rows: int, pitch: int) -> tuple[Filtering, Filtering, Any, Any]:

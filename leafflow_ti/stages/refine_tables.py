@@ -70,6 +70,7 @@ class RefineTables:
             Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
             Size.TRUST: images, Size.GAIN: TERMS * images, Size.GAIN_STEP: TERMS * images,
             Size.HOMOGRAPHY: Warp.GAIN * images, Size.PRODUCT: SHIFTS, Size.NORMAL: n * (n + 1) // 2, Size.RIGHT: n,
+            Size.HALVES: 2 * SHIFTS * images,
             Size.SCALAR: -(-Scalar.N // lanes), Size.GEOMETRY: Geometry.N * (images if gpu else 1),
         })  # fmt: skip
         size[Size.SLOT_REAL], size[Size.SLOT_PRECISE] = slot_real, slot_precise
