@@ -521,15 +521,16 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def masses(slot: ti.template(), size: ti.template(), r: ti.template(), p: ti.template()):
-        """Weight of the window, and how many samples of equal weight it stands for."""
+        """In the first pass: weight of the window, and how many samples of equal weight it stands for."""
         s = scalars(slot, size)
-        first = (slot.real + size[Size.WEIGHT]) * lanes
-        one, two = precise(0.0), precise(0.0)
-        for i in range(size[Size.SAMPLES]):
-            w = ti.cast(r[first + i], precise)
-            one += w
-            two += w * w
-        p[s + Scalar.MASS] = one
-        p[s + Scalar.EFFECTIVE] = one * one / ti.max(two, precise(1e-30))
+        if p[s + Scalar.PASSES] < 0.5:
+            first = (slot.real + size[Size.WEIGHT]) * lanes
+            one, two = precise(0.0), precise(0.0)
+            for i in range(size[Size.SAMPLES]):
+                w = ti.cast(r[first + i], precise)
+                one += w
+                two += w * w
+            p[s + Scalar.MASS] = one
+            p[s + Scalar.EFFECTIVE] = one * one / ti.max(two, precise(1e-30))
 
     return SimpleNamespace(begin=begin, masses=masses, solve=solve, finish=finish)
