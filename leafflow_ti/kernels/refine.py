@@ -20,12 +20,12 @@ class Stage(IntEnum):
 
     BEGIN = 0  # pixel
     WINDOW = auto()  # vector of samples
-    MASSES = auto()  # pixel
     AIM = auto()  # pixel
     PREPARE = auto()  # vector of images
     HAND_OVER = auto()  # image
     WARP = auto()  # vector of samples
     TEXTURE = auto()  # vector of samples
+    MASSES = auto()  # pixel
     GRAM = auto()  # function
     SUMS = auto()  # image
     SOLVE = auto()  # pixel
@@ -58,7 +58,6 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
         solver.begin(slot, pixel, size, image, start, P, p)
         for i in range(size[Size.SAMPLE_GROUPS]):
             samples.window(slot, i, at, size, sample, mask, S, r)
-        solver.masses(slot, size, r, p)
         while p[scalars(slot, size) + Scalar.DONE] < 0.5:
             warps.aim(slot, size, value, p)
             for i in range(size[Size.IMAGE_GROUPS]):
@@ -70,6 +69,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
                     samples.warp(slot, i, at, size, value, origin, sample, coef, S, r)
             for i in range(size[Size.SAMPLE_GROUPS]):
                 samples.texture(slot, i, size, value, sample, S, r, p)
+            solver.masses(slot, size, r, p)
             for i in range(FUNCTIONS):
                 samples.gram(slot, i, size, S, p)
             for i in range(size[Size.IMAGES]):
@@ -94,8 +94,6 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
             solver.begin(slot, pixel, size, image, start, P, p)
         elif ti.static(stage == Stage.WINDOW):
             samples.window(slot, i, centre[pixel], size, sample, mask, S, r)
-        elif ti.static(stage == Stage.MASSES):
-            solver.masses(slot, size, r, p)
         elif ti.static(stage == Stage.HALVES):
             samples.halves(slot, i, size, value, sample, S, r, p)
         elif ti.static(stage == Stage.SPREAD):
@@ -116,6 +114,8 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
                     samples.warp(slot, i, centre[pixel], size, value, origin, sample, coef, S, r)
             elif ti.static(stage == Stage.TEXTURE):
                 samples.texture(slot, i, size, value, sample, S, r, p)
+            elif ti.static(stage == Stage.MASSES):
+                solver.masses(slot, size, r, p)
             elif ti.static(stage == Stage.GRAM):
                 samples.gram(slot, i, size, S, p)
             elif ti.static(stage == Stage.SUMS):

@@ -197,6 +197,9 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
                 tyy = tyy + weight * (xy * xy * gxx + 2.0 * xy * yy * gxy + yy * yy * gyy)
         some = ti.select(mass > V(1e-6), V(1.0), V(0.0))
         scale = some / ti.max(mass, V(1e-6))
+        if not limit > 0.0:
+            # What no image shows is no part of the window.
+            S[slot.real + size[Size.WEIGHT] + group] = S[slot.real + size[Size.WEIGHT] + group] * some
         old = slot.real + size[Size.SCRATCH] + group
         S[old], S[old + groups], S[old + 2 * groups] = bxx, bxy, byy
         to = slot.real + size[Size.FUNCTION] + group

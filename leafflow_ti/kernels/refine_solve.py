@@ -155,6 +155,24 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
         return found
 
     @ti.func
+    def leave_light_out(slot: ti.template(), size: ti.template(), P: ti.template(), p: ti.template()):
+        """Take from the squared residuals of the images what a change of their photometric terms would."""
+        s, groups, terms = scalars(slot, size), size[Size.IMAGE_GROUPS], size[Size.TERMS]
+        whole, product = p[s + Scalar.MASS], slot.precise + size[Size.PRODUCT]
+        for g in range(groups):
+            lit = V(0.0)
+            for r in range(terms):
+                element = P[slot.precise + size[Size.SUMS] + (SHIFTS + r) * groups + g]
+                for k in range(r):
+                    element = element - P[product + k] * p[s + Scalar.TERMS + r * terms + k]
+                P[product + r] = element * (1.0 / p[s + Scalar.TERMS + r * terms + r])
+                lit = lit + P[product + r] * P[product + r]
+            share = ti.max(P[slot.precise + size[Size.MASS] + g] * (1.0 / whole), V(0.1))
+            energy = P[slot.precise + size[Size.ENERGY] + g]
+            # Of an image that is partly seen the explained part is an estimate.
+            P[slot.precise + size[Size.ENERGY] + g] = ti.max(energy - lit / share, 1e-6 * energy)
+
+    @ti.func
     def weigh(slot: ti.template(), size: ti.template(), image: ti.template(), P: ti.template(), p: ti.template()):
         """Cost of the pass, and the weights of the images from their residuals, against the harmonic mean of these."""
         s, groups = scalars(slot, size), size[Size.IMAGE_GROUPS]
@@ -355,7 +373,6 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
     def step(slot: ti.template(), size: ti.template(), value: ti.template(), P: ti.template(), p: ti.template()):
         """Solve the normal equations and go one step."""
         s, n = scalars(slot, size), size[Size.UNKNOWNS]
-        photometry(slot, size, p)
         centre_moves(slot, size, P, p)
         normal_equations(slot, s + Scalar.METRIC, 0, size, P, p)
         right_side(slot, size, P, p)
@@ -401,6 +418,9 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
         s = scalars(slot, size)
         p[s + Scalar.PASSES] += 1.0
         passes = ti.cast(p[s + Scalar.PASSES], ti.i32)
+        # The cost is that of the best photometric terms: without them a change of light would count as noise.
+        photometry(slot, size, p)
+        leave_light_out(slot, size, P, p)
         weigh(slot, size, image, P, p)
         cost = p[s + Scalar.COST]
         if passes == 1:
@@ -501,15 +521,16 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def masses(slot: ti.template(), size: ti.template(), r: ti.template(), p: ti.template()):
-        """Weight of the window, and how many samples of equal weight it stands for."""
+        """In the first pass: weight of the window, and how many samples of equal weight it stands for."""
         s = scalars(slot, size)
-        first = (slot.real + size[Size.WEIGHT]) * lanes
-        one, two = precise(0.0), precise(0.0)
-        for i in range(size[Size.SAMPLES]):
-            w = ti.cast(r[first + i], precise)
-            one += w
-            two += w * w
-        p[s + Scalar.MASS] = one
-        p[s + Scalar.EFFECTIVE] = one * one / ti.max(two, precise(1e-30))
+        if p[s + Scalar.PASSES] < 0.5:
+            first = (slot.real + size[Size.WEIGHT]) * lanes
+            one, two = precise(0.0), precise(0.0)
+            for i in range(size[Size.SAMPLES]):
+                w = ti.cast(r[first + i], precise)
+                one += w
+                two += w * w
+            p[s + Scalar.MASS] = one
+            p[s + Scalar.EFFECTIVE] = one * one / ti.max(two, precise(1e-30))
 
     return SimpleNamespace(begin=begin, masses=masses, solve=solve, finish=finish)

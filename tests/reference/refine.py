@@ -27,7 +27,8 @@ DEGREE = 5
 class Window:
     """Where and how one pixel is refined; ``views`` [K images], ``principal`` (px, py), ``sigma`` [px] of the window.
 
-    ``motion``, ``modes``: unknowns as in ``directions``; ``terms`` of light per image, 0 or 1, 3, 6.
+    ``motion``, ``modes``: unknowns as in ``directions``; ``terms`` of light per image, 0 or 1, 3, 6. ``shifts`` [K, 2]:
+    pixels by which the images lie further to the left and up than their cameras saw them (None: none do).
     """
 
     views: object
@@ -38,6 +39,7 @@ class Window:
     motion: int = 9
     modes: int = 0
     terms: int = 0
+    shifts: np.ndarray | None = None
 
     def __post_init__(self):
         self.offsets = window(self.size, self.thin)
@@ -45,6 +47,8 @@ class Window:
         self.along = directions(self.motion, self.modes)
         self.light = light_terms(self.offsets, self.size, self.terms)
         self.images = range(len(self.views.times))
+        if self.shifts is None:
+            self.shifts = np.zeros((len(self.images), 2))
 
 
 @dataclass
@@ -90,7 +94,7 @@ def evaluate(splines, w, state, light):
     values, gradients, hessians, blurs = [], [], [], []
     centre = np.zeros((1, 2))
     for k in w.images:
-        at = warp(w.views, state, w.offsets, k) + np.array(w.principal)
+        at = warp(w.views, state, w.offsets, k) + np.array(w.principal) - w.shifts[k]
         value, gradient, hessian = differences(splines[k], at)
         d = window_derivative(w.views, state, w.offsets, k)
         values.append(value)
