@@ -71,7 +71,7 @@ def filter_taps(degree: int) -> Array:
     taps = np.fft.fftshift(np.fft.ifft(np.fft.fft(gaussian) / np.fft.fft(spline(offset, degree)).real).real)
     radius = int(np.abs(np.flatnonzero(np.abs(taps) >= LEAST_TAP * taps.max()) - _PERIOD // 2).max())
     taps = taps[_PERIOD // 2 - radius : _PERIOD // 2 + radius + 1]
-    taps = np.asarray(taps / taps.sum())
+    taps = np.asarray((taps + taps[::-1]) / (2 * taps.sum()))
     taps.flags.writeable = False
     return taps
 
