@@ -54,6 +54,7 @@ class Size(IntEnum):
     ENERGY = auto()  # [groups]: squared residual
     MASS = auto()  # [groups]: weight of the valid samples
     TRUST = auto()  # [groups]: weight of an image
+    KEPT = auto()  # [groups]: 1, or 0 for an image that does not take part
     GAIN = auto()  # [TERMS, groups]
     GAIN_STEP = auto()  # [TERMS, groups]
     HOMOGRAPHY = auto()  # [Warp.GAIN, groups]

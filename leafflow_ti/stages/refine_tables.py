@@ -68,7 +68,7 @@ class RefineTables:
         })  # fmt: skip
         slot_precise = _lay_out(size, {
             Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
-            Size.TRUST: images, Size.GAIN: TERMS * images, Size.GAIN_STEP: TERMS * images,
+            Size.TRUST: images, Size.KEPT: images, Size.GAIN: TERMS * images, Size.GAIN_STEP: TERMS * images,
             Size.HOMOGRAPHY: Warp.GAIN * images, Size.PRODUCT: SHIFTS, Size.NORMAL: n * (n + 1) // 2, Size.RIGHT: n,
             Size.HALVES: 2 * SHIFTS * images,
             Size.SCALAR: -(-Scalar.N // lanes), Size.GEOMETRY: Geometry.N * (images if gpu else 1),
