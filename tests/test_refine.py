@@ -82,7 +82,7 @@ def standardised(device: Device, case: Case, noise: float, seeds: int) -> np.nda
     """Errors over error bars [windows, n] of ``seeds`` times the windows around PIXELS."""
     maps = truth(case.scene)
     states = np.array([true_state(maps, x, y) for x, y in PIXELS])
-    begin = states + [0.3, 0.01, 0.01, *[0.01] * 3, *[1e-4] * 3, *[0.0] * 6]
+    begin = states + np.array([0.3, 0.01, 0.01, *[0.01] * 3, *[1e-4] * 3, *[0.0] * 6])
     begin[:, 9:] = 0.0
     found = []
     for seed in range(seeds):
@@ -139,7 +139,7 @@ def test_masked_samples_do_not_count(device: Start) -> None:
     mask[Y - 7, X - 8 : X] = False
     found = case.refine(device("f64"), mask=mask)
     window = case.window()
-    window.weights = window.weights * mask[tuple((window.offsets + (X, Y)).astype(int).T[::-1])]
+    window.weights = window.weights * mask[tuple((window.offsets + np.array([X, Y])).astype(int).T[::-1])]
     wanted = case.twin(window=window)
     assert 0.5 < window.weights.sum() / case.window().weights.sum() < 0.7
     errors = np.sqrt(np.diag(wanted.covariance))
@@ -213,7 +213,7 @@ def specular(images: np.ndarray) -> None:
 
 @pytest.mark.parametrize("spoil", [broken_frame, occluded, specular])
 def test_outliers_do_not_count(device: Start, case: Case, spoil: Callable[[np.ndarray], None]) -> None:
-    """Robust weights keep the errors within a few error bars of clean images; the twin, which has none, loses by far."""
+    """Robust weights keep the errors within a few error bars of clean images; the twin, without them, loses by far."""
     images = case.images.copy()
     spoil(images)
     found = case.refine(device("f32"), images=images)

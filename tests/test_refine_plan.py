@@ -1,4 +1,4 @@
-"""The plan of the refinement: the filter of its images, what is refined where, what is refused, memory and maps."""
+"""The plan of the refinement: what is refined where, what is refused, memory and maps."""
 
 from __future__ import annotations
 
@@ -7,35 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter1d
 
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import load_config
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.plan import Plan, make_plan
-from leafflow_ti.refine_plan import FILTER_RADIUS, LEAST_TAP, PREFILTER_SIGMA, Refinement, filter_taps
-
-
-def test_filter_is_a_gaussian_and_the_splines_own() -> None:
-    """Against SciPy's recursive filter; what is cut off are taps below 1e-7 of the largest."""
-    taps = filter_taps()
-    assert len(taps) == 2 * FILTER_RADIUS + 1
-    np.testing.assert_array_equal(taps, taps[::-1])
-    assert taps.sum() == pytest.approx(1, abs=1e-15)
-    assert np.abs(taps).min() >= LEAST_TAP * taps.max()
-    row = np.random.default_rng(0).uniform(0, 255, 200)
-    wanted = spline_filter1d(gaussian_filter(row, PREFILTER_SIGMA, truncate=8, mode="mirror"), 3, mode="mirror")
-    # Twice the first tap left out, .27 of the last, and the geometric tail behind it; far from the ends.
-    inner = slice(60, -60)
-    np.testing.assert_allclose(np.convolve(row, taps, "same")[inner], wanted[inner], atol=255 * 1e-7)
-
-
-def test_spline_of_the_coefficients_is_the_smoothed_image() -> None:
-    row = np.random.default_rng(1).uniform(0, 255, 200)
-    coefficients = np.convolve(row, filter_taps(), "same")
-    at = np.arange(60, 140)
-    found = map_coordinates(coefficients, at[None], order=3, prefilter=False, mode="mirror")
-    np.testing.assert_allclose(found, gaussian_filter(row, PREFILTER_SIGMA, truncate=8)[at], atol=255 * 1e-7)
+from leafflow_ti.refine_plan import Refinement
+from leafflow_ti.splines import FILTER_RADIUS, SUPPORT
 
 
 def capture(frames: int = 9, rows: int = 1, cols: int = 9, size: tuple[int, int] = (96, 128)) -> Capture:
@@ -62,7 +40,7 @@ def test_default_is_refined_with_all_images_of_the_window() -> None:
     assert (found.motion, found.modes, found.terms, found.unknowns) == (9, 1, 0, 13)
     # Half the window; four camera steps, two pixels for each of four frames, four besides; the spline and its filter.
     assert found.reach == 4 + 2 * 4 + 4
-    assert found.halo == 16 + found.reach + 2 + FILTER_RADIUS
+    assert found.halo == 16 + found.reach + SUPPORT + FILTER_RADIUS
 
 
 def test_cameras_stand_in_the_order_of_the_block() -> None:
@@ -103,7 +81,8 @@ def test_unknowns_and_maps(options: dict[str, Any], motion: int, modes: int) -> 
     assert {"disparity", *planned.refine.names} <= set(names)
     assert ("rotation_z" in names, "acceleration_z" in names) == (motion >= 6, motion == 9)
     assert ("growth_rate" in names, "strain_rate_12" in names) == (modes > 0, modes == 3)
-    assert (planned.margin, planned.differences) == (1, False)
+    # Maps that the model would give, too, are where a pixel begins that is not refined.
+    assert (planned.margin, planned.differences) == (1, "growth_rate" in planned.measured and modes > 0)
 
 
 def test_static_scenes_have_no_motion() -> None:
