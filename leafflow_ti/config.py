@@ -147,12 +147,14 @@ class RefineSection(_Section):
     """Exact refinement: at most ``steps`` Gauss-Newton steps (0: none) on every ``thin``-th pixel of a ``window``.
 
     "auto": ``steps`` as the preset has them for affine-scene-flow, else 0; ``window``: that of the model; ``thin``:
-    some 21 samples across the window, or more where the preset says so.
+    some 21 samples across the window, or more where the preset says so; ``spline``: the degree of the interpolation, 7
+    with precision f64.
     """
 
     steps: _AutoSteps = "auto"
     window: _AutoRefined = "auto"
     thin: _AutoCount = "auto"
+    spline: Annotated[Literal[5, 7] | _Auto, BeforeValidator(lambda v: int(v) if str(v) in ("5", "7") else v)] = "auto"
 
 
 class PlanSection(_Section):
@@ -332,7 +334,12 @@ def resolve(config: RunConfig, n_frames: int, n_rows: int, n_cols: int) -> RunCo
     sections = {
         "model": {"name": name},
         "window": {"stride": decided(window.stride, max(preset.stride, REFINED_STRIDE if steps else 1))},
-        "refine": {"steps": steps, "window": size, "thin": decided(refine.thin, thin)},
+        "refine": {
+            "steps": steps,
+            "window": size,
+            "thin": decided(refine.thin, thin),
+            "spline": decided(refine.spline, 7 if config.precision == "f64" else 5),
+        },
     }
     updated = {key: getattr(config, key).model_copy(update=values) for key, values in sections.items()}
     return config.model_copy(update=updated)

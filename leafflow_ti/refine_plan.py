@@ -12,7 +12,7 @@ from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
 from leafflow_ti.presets import REFINED_WINDOW
-from leafflow_ti.splines import FILTER_RADIUS, SUPPORT
+from leafflow_ti.splines import filter_radius, support
 
 PIXEL_VARIANCE = 1 / 12
 """Variance of a pixel's area [px²], over which the sensor has averaged already."""
@@ -28,7 +28,8 @@ class Refinement:
     ``frames``: offsets from the reference frame; ``cameras``: (x, y) steps from the reference camera, in the order of
     a block's images (rows, then columns). Unknowns are depth and slopes (Z0, ZX, ZY); ``motion``: how many of
     (N, Ω, A): 0, 3, 6 or 9; ``modes`` of the deformation in the patch's plane: 0, 1 (growth alike in all directions),
-    3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6.
+    3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6. ``degree``
+    of the splines, 5 or 7.
     """
 
     steps: int
@@ -40,6 +41,7 @@ class Refinement:
     motion: int
     modes: int
     terms: int
+    degree: int = 5
 
     @property
     def unknowns(self) -> int:
@@ -60,7 +62,7 @@ class Refinement:
     @property
     def halo(self) -> int:
         """Pixels of the images that a measurement needs on each side."""
-        return self.size // 2 + self.reach + SUPPORT + FILTER_RADIUS
+        return self.size // 2 + self.reach + support(self.degree) + filter_radius(self.degree)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,7 +77,8 @@ class Refinement:
         return (
             f"refinement  at most {self.steps} steps, window of {self.size} px thinned by {self.thin} "
             f"({self.across**2} samples), {len(self.frames)} frames of {len(self.cameras)} cameras; {self.unknowns} "
-            f"unknowns (depth, slopes, {self.motion} of motion, {modes}), {self.terms} photometric terms an image"
+            f"unknowns (depth, slopes, {self.motion} of motion, {modes}), {self.terms} photometric terms an image, "
+            f"splines of degree {self.degree}"
         )
 
 
@@ -130,4 +133,4 @@ def plan_refinement(
     terms = 6 if curved else _TERMS[model.brightness]
     sigma = window.sigma * size / window.size
     frames = tuple(temporal or (0,))
-    return Refinement(steps, size, sigma, thin, frames, cameras, motion, modes, terms)
+    return Refinement(steps, size, sigma, thin, frames, cameras, motion, modes, terms, int(config.refine.spline))

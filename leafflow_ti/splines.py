@@ -1,6 +1,8 @@
-"""Quintic B-splines: their pieces, and the filter from grey values to the coefficients of the smoothed image.
+"""B-splines of odd degree n: their pieces, and the filter from grey values to coefficients of the smoothed image.
 
-The basis function has the support -3..3; between two pixels a point ``u`` behind the left one has six neighbours.
+The basis function reaches ±(n + 1)/2 far; between two pixels a point ``u`` behind the left one has n + 1 neighbours.
+A texture of frequency ω [rad/px] is misplaced by up to ``a/ω`` px, ``a = (ω / (2π - ω))^(n + 1)``, as a sine of the
+fraction of a pixel.
 """
 
 from __future__ import annotations
@@ -14,9 +16,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-DEGREE = 5
-SUPPORT = 3
-"""Reach of the basis function [px]."""
 PREFILTER_SIGMA = 0.7
 """Gaussian of the images [px]: below, interpolation errs; above, texture is lost."""
 LEAST_TAP = 1e-7
@@ -24,20 +23,25 @@ LEAST_TAP = 1e-7
 _PERIOD = 1024
 
 
-@functools.cache
-def spline_pieces() -> Array:
-    """Weights of the neighbours as polynomials of u: [derivative 0..2, neighbour 0..5, power 0..5].
+def support(degree: int) -> int:
+    """Reach of the basis function [px]."""
+    return (degree + 1) // 2
 
-    Neighbour m lies ``m - 2`` pixels behind the pixel left of the point.
+
+@functools.cache
+def spline_pieces(degree: int) -> Array:
+    """Weights of the neighbours as polynomials of u: [derivative 0..2, neighbour 0..degree, power 0..degree].
+
+    Neighbour m lies ``m + 1 - support`` pixels behind the pixel left of the point.
     """
     # Cardinal splines of support 0..n+1, piece by piece: n β_n(x) = x β_(n-1)(x) + (n + 1 - x) β_(n-1)(x - 1).
     pieces = [Polynomial([1.0])]
-    for n in range(1, DEGREE + 1):
+    for n in range(1, degree + 1):
         padded = [Polynomial([0.0]), *pieces, Polynomial([0.0])]
         pieces = [
             (Polynomial([j, 1]) * padded[j + 1] + Polynomial([n + 1 - j, -1]) * padded[j]) / n for j in range(n + 1)
         ]
-    found = np.zeros((3, DEGREE + 1, DEGREE + 1))
+    found = np.zeros((3, degree + 1, degree + 1))
     for m, piece in enumerate(reversed(pieces)):
         for d in range(3):
             coefficients = piece.deriv(d).coef if d else piece.coef
@@ -46,30 +50,32 @@ def spline_pieces() -> Array:
     return found
 
 
-def spline(u: NDArray[Any]) -> Array:
+def spline(u: NDArray[Any], degree: int) -> Array:
     """The basis function at ``u`` px from its centre."""
-    inside = (u > -SUPPORT) & (u < SUPPORT)
+    reach = support(degree)
+    inside = (u > -reach) & (u < reach)
     left = np.floor(u)
-    neighbour = np.where(inside, 2 - left, 0).astype(int)
-    powers = np.power.outer(u - left, np.arange(DEGREE + 1))
-    return np.asarray(np.where(inside, np.sum(spline_pieces()[0][neighbour] * powers, axis=-1), 0.0))
+    neighbour = np.where(inside, reach - 1 - left, 0).astype(int)
+    powers = np.power.outer(u - left, np.arange(degree + 1))
+    return np.asarray(np.where(inside, np.sum(spline_pieces(degree)[0][neighbour] * powers, axis=-1), 0.0))
 
 
 @functools.cache
-def filter_taps() -> Array:
+def filter_taps(degree: int) -> Array:
     """Symmetric kernel from grey values to spline coefficients of the smoothed image, float64 [2 radius + 1].
 
     A Gaussian of ``PREFILTER_SIGMA`` and the inverse of the sampled spline, along one axis; the sum is 1.
     """
     offset = np.fft.fftfreq(_PERIOD, 1 / _PERIOD)
     gaussian = np.exp(-0.5 * (offset / PREFILTER_SIGMA) ** 2)
-    taps = np.fft.fftshift(np.fft.ifft(np.fft.fft(gaussian) / np.fft.fft(spline(offset)).real).real)
+    taps = np.fft.fftshift(np.fft.ifft(np.fft.fft(gaussian) / np.fft.fft(spline(offset, degree)).real).real)
     radius = int(np.abs(np.flatnonzero(np.abs(taps) >= LEAST_TAP * taps.max()) - _PERIOD // 2).max())
     taps = taps[_PERIOD // 2 - radius : _PERIOD // 2 + radius + 1]
-    taps = np.asarray(taps / taps.sum())
+    taps = np.asarray((taps + taps[::-1]) / (2 * taps.sum()))
     taps.flags.writeable = False
     return taps
 
 
-FILTER_RADIUS = len(filter_taps()) // 2
-"""Pixels that a coefficient needs on each side."""
+def filter_radius(degree: int) -> int:
+    """Pixels that a coefficient needs on each side."""
+    return len(filter_taps(degree)) // 2

@@ -36,14 +36,14 @@ class Stage(IntEnum):
 
 
 @functools.cache
-def refine_kernel(spec: KernelSpec, stage: Stage | None = None):
-    """All stages for every pixel of a batch, or (on a GPU) one of them.
+def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
+    """All stages for every pixel of a batch, or (on a GPU) one of them; ``taps``: of the splines along an axis.
 
     Pixel i of the batch works in slot i, or, on the CPU, in the slot of its task. ``S`` and ``r``, ``P`` and ``p`` are
     the same memory: vectors and numbers. A pixel that is done is left alone.
     """
     real, precise, lanes = spec.real, spec.precise, spec.lanes
-    warps, samples, solver = warp_functions(spec), sample_functions(spec), solve_functions(spec)
+    warps, samples, solver = warp_functions(spec), sample_functions(spec, taps), solve_functions(spec)
     scalars = warps.scalars
     reals, precises = lane_type(real, lanes), spec.element
 

@@ -2,7 +2,7 @@
 
     V_k(δ) = g_k(δ) (T(δ) + blur_k · (Txx, Txy, Tyy))        g_k = 1 + Σ a_k,m φ_m(δ)
 
-Images are interpolated by quintic B-splines. What smooths an image (the area of a pixel, the prefilter) is isotropic
+Images are interpolated by B-splines. What smooths an image (the area of a pixel, the prefilter) is isotropic
 there, so images in which the surface looks narrower show it smoother along that direction: to first order by the second
 derivatives of the texture, with weights that follow from the warps (``Warp.BLUR``).
 """
@@ -21,8 +21,12 @@ for each neighbour: measured, three quarters of the time of an interpolation."""
 
 
 @functools.cache
-def sample_functions(spec: KernelSpec) -> SimpleNamespace:
-    """Stages on the samples of a window; ``S`` is their workspace in vectors, ``r`` the same in numbers."""
+def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
+    """Stages on the samples of a window; ``S`` is their workspace in vectors, ``r`` the same in numbers.
+
+    ``taps``: neighbours along an axis that a spline weighs, its degree + 1.
+    """
+    reach = float(taps // 2 - 1)
     real, precise, lanes = spec.real, spec.precise, spec.lanes
     V = lane_type(real, lanes)
     scalars = warp_functions(spec).scalars
@@ -82,10 +86,10 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def spline(m: ti.i32, derivative: ti.i32, u: ti.template(), value: ti.template()):
-        """Weight of neighbour m of six for a point ``u`` behind the third one, or a derivative of the weight."""
-        at = Value.SPLINE + (6 * derivative + m) * 6
-        w = ti.cast(value[at + 5], real) * u + ti.cast(value[at + 4], real)
-        for k in ti.static(range(3, -1, -1)):
+        """Weight of neighbour m for a point ``u`` behind the middle one, or a derivative of the weight."""
+        at = Value.SPLINE + (taps * derivative + m) * taps
+        w = ti.cast(value[at + taps - 1], real) * u + ti.cast(value[at + taps - 2], real)
+        for k in ti.static(range(taps - 3, -1, -1)):
             w = w * u + ti.cast(value[at + k], real)
         return w
 
@@ -94,7 +98,7 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
         slot: ti.template(), group: ti.i32, centre: ti.i32, size: ti.template(), value: ti.template(),
         origin: ti.template(), sample: ti.template(), coef: ti.template(), S: ti.template(), r: ti.template(),
     ):  # fmt: skip
-        """Value and derivatives, to the second, of every image at one vector of samples: quintic B-splines."""
+        """Value and derivatives, to the second, of every image at one vector of samples."""
         groups, pitch = size[Size.SAMPLE_GROUPS], size[Size.PITCH]
         farthest = ti.cast(value[Value.LIMIT], real)
         x, y = sample[group], sample[groups + group]
@@ -106,34 +110,23 @@ def sample_functions(spec: KernelSpec) -> SimpleNamespace:
             iy = ti.max(ti.min(iy, V(farthest)), V(0.0 - farthest))
             fx, fy = ti.floor(ix), ti.floor(iy)
             u, v = ix - fx, iy - fy
-            corner = (fy - 2.0) * ti.cast(pitch, real) + (fx - 2.0)
-            a0, a1, a2 = spline(0, 0, u, value), spline(1, 0, u, value), spline(2, 0, u, value)
-            a3, a4, a5 = spline(3, 0, u, value), spline(4, 0, u, value), spline(5, 0, u, value)
-            d0, d1, d2 = spline(0, 1, u, value), spline(1, 1, u, value), spline(2, 1, u, value)
-            d3, d4, d5 = spline(3, 1, u, value), spline(4, 1, u, value), spline(5, 1, u, value)
-            e0, e1, e2 = spline(0, 2, u, value), spline(1, 2, u, value), spline(2, 2, u, value)
-            e3, e4, e5 = spline(3, 2, u, value), spline(4, 2, u, value), spline(5, 2, u, value)
+            corner = (fy - reach) * ti.cast(pitch, real) + (fx - reach)
             val, gx, gy, gxx, gxy, gyy = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
             worst = V(0.0)
-            for row in range(6):
+            for row in range(taps):
                 first = origin[k] + centre + row * pitch
-                c0, c1, c2, c3, c4, c5 = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
-                if ti.static(lanes == 1):
-                    b = first + ti.cast(corner, ti.i32)
-                    c0, c1, c2, c3, c4, c5 = coef[b], coef[b + 1], coef[b + 2], coef[b + 3], coef[b + 4], coef[b + 5]
-                else:
-                    for i in ti.static(range(lanes)):
-                        b = (first + ti.cast(corner[i], ti.i32)) & NO_WRAP
-                        c0[i] = coef[b]
-                        c1[i] = coef[b + 1]
-                        c2[i] = coef[b + 2]
-                        c3[i] = coef[b + 3]
-                        c4[i] = coef[b + 4]
-                        c5[i] = coef[b + 5]
-                worst = ti.max(worst, ti.max(ti.max(ti.max(c0, c1), ti.max(c2, c3)), ti.max(c4, c5)))
-                along = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3 + a4 * c4 + a5 * c5
-                slope = d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3 + d4 * c4 + d5 * c5
-                bend = e0 * c0 + e1 * c1 + e2 * c2 + e3 * c3 + e4 * c4 + e5 * c5
+                along, slope, bend = V(0.0), V(0.0), V(0.0)
+                for col in ti.static(range(taps)):
+                    c = V(0.0)
+                    if ti.static(lanes == 1):
+                        c = coef[first + ti.cast(corner, ti.i32) + col]
+                    else:
+                        for i in ti.static(range(lanes)):
+                            c[i] = coef[((first + ti.cast(corner[i], ti.i32)) & NO_WRAP) + col]
+                    worst = ti.max(worst, c)
+                    along = along + spline(col, 0, u, value) * c
+                    slope = slope + spline(col, 1, u, value) * c
+                    bend = bend + spline(col, 2, u, value) * c
                 b0, b1 = spline(row, 0, v, value), spline(row, 1, v, value)
                 val = val + b0 * along
                 gx = gx + b0 * slope

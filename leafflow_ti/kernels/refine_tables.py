@@ -12,6 +12,7 @@ SHIFTS = 8
 TERMS = 6
 """Most photometric terms of an image."""
 FUNCTIONS = SHIFTS + TERMS
+MAX_NEIGHBOURS = 16
 DERIVATIVES = 6
 """Of a sample: value, x, y, xx, xy, yy."""
 MAX_UNKNOWNS = 15
@@ -111,8 +112,8 @@ class Value(IntEnum):
     HALF = auto()  # half the window, px
     LIMIT = auto()  # farthest that a sample may lie from the centre of its block, px
     CORRELATION = auto()  # sum of the noise correlation over the lattice times Σw² / Σw
-    SPLINE = auto()  # [3, 6, 6]: quintic B-spline and two derivatives: neighbour, power
-    CORRELATION_AT = SPLINE + 108  # noise correlation along one axis at 0, 1, ... steps of the lattice
+    CORRELATION_AT = 8  # [MAX_NEIGHBOURS]: noise correlation along one axis at 0, 1, ... steps of the lattice
+    SPLINE = CORRELATION_AT + MAX_NEIGHBOURS  # [3, taps, taps]: weights and two derivatives: neighbour, power
 
 
 class Scalar(IntEnum):

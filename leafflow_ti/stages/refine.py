@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.refine_plan import Refinement
 from leafflow_ti.runtime import Device
-from leafflow_ti.splines import FILTER_RADIUS, filter_taps
+from leafflow_ti.splines import filter_radius, filter_taps
 from leafflow_ti.stages.estimate_tables import View
 from leafflow_ti.stages.planes import Filtering, round_up
 from leafflow_ti.stages.refine_tables import RefineTables
@@ -67,7 +67,7 @@ class RefineStage:
         self._coefficients = device.zeros(n * n_frames * self._plane)
         self._slots: deque[int] = deque(maxlen=n_frames)
         self._next = 0
-        self._filters = _filters(device, rows, self.pitch)
+        self._filters = _filters(device, rows, self.pitch, plan.degree)
         self._mask: Any = None
         lanes = device.dense.lanes
         tables = RefineTables.of(plan, view, lanes, self.pitch, device.gpu)
@@ -119,7 +119,7 @@ class RefineStage:
     def _filter(self, image: Array, spoilt: NDArray[np.bool_] | None, to: int, nothing: float) -> None:
         """Spline coefficients of one image; the outermost rows and columns, which lack neighbours, are none."""
         along_y, along_x, padded, tall = self._filters
-        r = FILTER_RADIUS
+        r = filter_radius(self.plan.degree)
         wide = np.zeros((self.rows + 2 * r, self.pitch), image.dtype)
         wide[r:-r, : self.cols] = image
         self.device.write(padded, 0, wide)
@@ -183,9 +183,9 @@ class RefineStage:
         from leafflow_ti.kernels.refine import Stage, refine_kernel
         from leafflow_ti.kernels.refine_tables import FUNCTIONS, SHIFTS, Size
 
-        spec = self.device.dense
+        spec, taps = self.device.dense, self.plan.degree + 1
         if not self.device.gpu:
-            refine_kernel(spec)(first, pixels, 1, min(pixels, self._slots_n), *arguments)
+            refine_kernel(spec, taps)(first, pixels, 1, min(pixels, self._slots_n), *arguments)
             return
         size = self.size
         parts = {
@@ -197,7 +197,7 @@ class RefineStage:
 
         def launch(stages: range) -> None:
             for stage in map(Stage, stages):
-                refine_kernel(spec, stage)(first, pixels, int(parts.get(stage, 1)), 1, *arguments)
+                refine_kernel(spec, taps, stage)(first, pixels, int(parts.get(stage, 1)), 1, *arguments)
 
         launch(range(Stage.BEGIN, Stage.AIM))
         for _ in range(self.plan.steps):
@@ -205,9 +205,9 @@ class RefineStage:
         launch(range(Stage.HALVES, Stage.FINISH + 1))
 
 
-def _filters(device: Device, rows: int, pitch: int) -> tuple[Filtering, Filtering, Any, Any]:
+def _filters(device: Device, rows: int, pitch: int, degree: int) -> tuple[Filtering, Filtering, Any, Any]:
     """Filters along y and x, and the arrays between them: [rows + 2 radius, pitch], and [rows, pitch] behind radius."""
-    taps, r = filter_taps().tolist(), FILTER_RADIUS
+    taps, r = filter_taps(degree).tolist(), filter_radius(degree)
     along_y = Filtering(device, [[(i * pitch, w) for i, w in enumerate(taps)]], rows, pitch, pitch)
     along_x = Filtering(device, [list(enumerate(taps))], rows, pitch, pitch)
     padded = device.zeros((rows + 2 * r) * pitch)

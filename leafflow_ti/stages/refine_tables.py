@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.refine_plan import PIXEL_VARIANCE, Refinement
-from leafflow_ti.splines import FILTER_RADIUS, PREFILTER_SIGMA, SUPPORT, filter_taps, spline, spline_pieces
+from leafflow_ti.splines import PREFILTER_SIGMA, filter_radius, filter_taps, spline, spline_pieces, support
 from leafflow_ti.stages.estimate_tables import View
 
 Array = NDArray[Any]
@@ -53,7 +53,7 @@ class RefineTables:
         groups = -(-n_samples // lanes)
         size = np.zeros(Size.LIST + n, np.int32)
         size[Size.LIST :] = unknowns
-        correlation = _noise_correlation(plan.thin)
+        correlation = _noise_correlation(plan.thin, plan.degree)
         for name, entry in {
             Size.UNKNOWNS: n, Size.MODES: plan.modes, Size.TERMS: plan.terms, Size.IMAGES: k,
             Size.IMAGE_GROUPS: images, Size.SAMPLES: n_samples, Size.SAMPLE_GROUPS: groups, Size.ACROSS: plan.across,
@@ -88,14 +88,15 @@ class RefineTables:
             image[Image.CAMERA_X + axis, :k] = np.tile(steps[:, axis] * view.baseline_mm[axis], len(plan.frames))
             image[Image.SHIFT_X + axis, :k] = np.tile(steps[:, axis] * view.shift_px[axis], len(plan.frames))
 
-        value = np.zeros(Value.CORRELATION_AT + len(correlation))
+        pieces = spline_pieces(plan.degree).ravel()
+        value = np.zeros(Value.SPLINE + pieces.size)
         value[Value.FOCAL], value[Value.HALF] = view.f_px, plan.size / 2
         value[Value.SMOOTHING] = 0.5 * (PIXEL_VARIANCE + PREFILTER_SIGMA**2)
         value[Value.LIMIT] = plan.size // 2 + plan.reach
         both = 2 * correlation.sum() - 1
         value[Value.CORRELATION] = both**2 * np.sum(sample[2] ** 2) / np.sum(sample[2])
-        value[Value.SPLINE : Value.CORRELATION_AT] = spline_pieces().ravel()
-        value[Value.CORRELATION_AT :] = correlation
+        value[Value.CORRELATION_AT :][: correlation.size] = correlation
+        value[Value.SPLINE :] = pieces
         return cls(size, value, image, sample, slot_real, slot_precise)
 
 
@@ -115,17 +116,16 @@ def _lay_out(size: NDArray[np.int32], lengths: dict[Any, int]) -> int:
     return at
 
 
-def _noise_correlation(thin: int) -> Array:
+def _noise_correlation(thin: int, degree: int) -> Array:
     """Correlation of the noise of warped images at 0, ``thin``, 2 ``thin``, ... px, until it is below 1e-3.
 
     White noise that is filtered and interpolated at positions that fall anywhere between the pixels has, on average,
     the autocorrelation of the cardinal spline of the filter.
     """
     fine = 32
-    taps = filter_taps()
-    radius = FILTER_RADIUS + SUPPORT
+    taps, radius = filter_taps(degree), filter_radius(degree) + support(degree)
     u = np.arange(-radius * fine, radius * fine + 1) / fine
-    impulse = np.sum([tap * spline(u - r) for r, tap in enumerate(taps, -FILTER_RADIUS)], axis=0)
+    impulse = np.sum([tap * spline(u - r, degree) for r, tap in enumerate(taps, -filter_radius(degree))], axis=0)
     found = np.correlate(impulse, impulse, "full")
     found = found[len(u) - 1 :: thin * fine] / found[len(u) - 1]
     return np.asarray(found[: int(np.flatnonzero(np.abs(found) > 1e-3).max()) + 1])

@@ -13,12 +13,14 @@ import numpy as np
 from scipy import ndimage
 
 from leafflow_ti.refine_plan import PIXEL_VARIANCE
-from leafflow_ti.splines import DEGREE, PREFILTER_SIGMA
+from leafflow_ti.splines import PREFILTER_SIGMA
 from leafflow_ti.synthetic.bound import eliminate, light_terms
 from leafflow_ti.synthetic.moving_patch import directions, pulled_back, warp, window, window_derivative
 
 BLUR = PIXEL_VARIANCE + PREFILTER_SIGMA**2
 CORRELATED_PX = 6
+DEGREE = 5
+"""Of the splines: the twin is that of the kernels with ``spline = 5``."""
 
 
 @dataclass
