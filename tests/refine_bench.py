@@ -113,10 +113,10 @@ class Case:
             self.terms, self.shifts,
         )  # fmt: skip
 
-    def twin(self, **options: Any) -> twin.Refined:
-        """What the twin finds."""
-        flat = self.images.reshape(-1, *self.images.shape[2:])
-        return twin.refine(twin.coefficients(flat), self.window(), self.start, **options)
+    def twin(self, images: np.ndarray | None = None, window: twin.Window | None = None, **options: Any) -> twin.Refined:
+        """What the twin finds in these images (default: the scene's)."""
+        flat = (self.images if images is None else images).reshape(-1, *self.images.shape[2:])
+        return twin.refine(twin.coefficients(flat), window or self.window(), self.start, **options)
 
     def stage(
         self, device: Device, images: np.ndarray | None = None, valid: np.ndarray | None = None,

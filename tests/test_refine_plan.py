@@ -1,4 +1,4 @@
-"""The plan of the refinement: the filter of its images, what is refined where, what is refused, memory and maps."""
+"""The plan of the refinement: what is refined where, what is refused, memory and maps."""
 
 from __future__ import annotations
 
@@ -7,44 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
-from scipy.ndimage import gaussian_filter, spline_filter1d
 
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import load_config
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.plan import Plan, make_plan
 from leafflow_ti.refine_plan import Refinement
-from leafflow_ti.splines import LEAST_TAP, PREFILTER_SIGMA, filter_radius, filter_taps, spline, spline_pieces, support
-
-
-@pytest.mark.parametrize("degree", [5, 7])
-def test_filter_is_a_gaussian_and_the_splines_own(degree: int) -> None:
-    """Its coefficients, at the pixels, are the smoothed image; what is cut off are taps below 1e-7 of the largest."""
-    taps = filter_taps(degree)
-    assert len(taps) == 2 * filter_radius(degree) + 1
-    np.testing.assert_array_equal(taps, taps[::-1])
-    assert taps.sum() == pytest.approx(1, abs=1e-15)
-    assert np.abs(taps).min() >= LEAST_TAP * taps.max()
-    row = np.random.default_rng(0).uniform(0, 255, 200)
-    smooth = gaussian_filter(row, PREFILTER_SIGMA, truncate=8, mode="mirror")
-    there = np.convolve(np.convolve(row, taps, "same"), spline(np.arange(-3.0, 4.0), degree), "same")
-    # Twice the first tap left out, .54 of the last, and the geometric tail behind it; far from the ends.
-    inner = slice(60, -60)
-    np.testing.assert_allclose(there[inner], smooth[inner], atol=255 * 4e-7)
-    if degree == 5:
-        wanted = spline_filter1d(smooth, degree, mode="mirror")
-        np.testing.assert_allclose(np.convolve(row, taps, "same")[inner], wanted[inner], atol=255 * 4e-7)
-
-
-@pytest.mark.parametrize("degree", [5, 7])
-def test_pieces_are_the_basis_functions(degree: int) -> None:
-    u, reach = 0.3, support(degree)
-    basis = BSpline.basis_element(np.arange(degree + 2.0) - (degree + 1) / 2, extrapolate=False)
-    for d in range(3):
-        weights = spline_pieces(degree)[d] @ u ** np.arange(degree + 1)
-        wanted = [basis.derivative(d)(u - m - 1 + reach) if d else basis(u - m - 1 + reach) for m in range(degree + 1)]
-        np.testing.assert_allclose(weights, wanted, atol=1e-14)
+from leafflow_ti.splines import filter_radius
 
 
 def capture(frames: int = 9, rows: int = 1, cols: int = 9, size: tuple[int, int] = (96, 128)) -> Capture:
