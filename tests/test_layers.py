@@ -21,12 +21,13 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(
         ("capture", "models", "config", "config_values", "geometry", "field", "filters", "sampling", "range_flow"), 3
     ),
-    **dict.fromkeys(("presets", "refine_plan"), 3),
+    **dict.fromkeys(("presets", "refine_plan", "splines"), 3),
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
     **dict.fromkeys(("growth",), 5),
     **dict.fromkeys(("bands", "model_plan", "plan", "reading", "engines", "pipeline", "results", "work"), 6),
+    **dict.fromkeys(("refinement", "refine_work"), 6),
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases"), 7),
     **dict.fromkeys(("cli",), 8),
