@@ -127,7 +127,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.ACCEPTED + i] = start[at + 2 + i]
         for i in range(Scalar.COST, Scalar.ROBUST + 1):
             p[s + i] = precise(0.0)
-        p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
+        p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT], p[s + Scalar.SAMPLINGS] = precise(1.0), precise(0.0), precise(0.0)
         for g in range(groups):
             P[slot.precise + size[Size.KEPT] + g] = image[Image.PRESENT * groups + g]
             P[slot.precise + size[Size.TRUST] + g] = image[Image.PRESENT * groups + g]
@@ -422,6 +422,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
         """Judge the pass, and go a step further, or half a step back; the pass after the last one only judges."""
         s = scalars(slot, size)
         p[s + Scalar.PASSES] += 1.0
+        p[s + Scalar.SAMPLINGS] += p[s + Scalar.RESAMPLE]
         passes = ti.cast(p[s + Scalar.PASSES], ti.i32)
         # The cost is that of the best photometric terms: without them a change of light would count as noise.
         photometry(slot, size, p)
@@ -484,6 +485,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
         s, n = scalars(slot, size), size[Size.UNKNOWNS]
         to = pixel * Out.N
         out[to + Out.CODE], out[to + Out.PASSES] = p[s + Scalar.CODE], p[s + Scalar.PASSES]
+        out[to + Out.SAMPLINGS] = p[s + Scalar.SAMPLINGS]
         out[to + Out.START], out[to + Out.COST] = p[s + Scalar.START], p[s + Scalar.COST]
         for i in range(MAX_UNKNOWNS):
             out[to + Out.Q + i] = p[s + Scalar.Q + i]

@@ -156,6 +156,7 @@ class Scalar(IntEnum):
     EFFECTIVE = 1346  # samples of equal weight that the window stands for
     RESAMPLE = 1347  # whether the images are sampled in this pass
     DRIFT = 1348  # px that the warps have moved since
+    SAMPLINGS = 1349  # passes in which they were
     N = 1360
 
 
@@ -174,6 +175,7 @@ class Out(IntEnum):
 
     CODE = 0
     PASSES = auto()
+    SAMPLINGS = auto()
     START = auto()  # mean squared residual of the start
     COST = auto()
     Q = auto()  # [MAX_UNKNOWNS]
