@@ -88,13 +88,14 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
         return (r[at + 3 * along] * x + r[at + 3 * along + 1] * y + r[at + 3 * along + 2]) * depth
 
     @ti.func
-    def spline(m: ti.i32, derivative: ti.i32, u: ti.template(), value: ti.template()):
-        """Weight of neighbour m for a point ``u`` behind the middle one, or a derivative of the weight."""
-        at = Value.SPLINE + (taps * derivative + m) * taps
-        w = ti.cast(value[at + taps - 1], real) * u + ti.cast(value[at + taps - 2], real)
-        for k in ti.static(range(taps - 3, -1, -1)):
-            w = w * u + ti.cast(value[at + k], real)
-        return w
+    def spline(m: ti.i32, u: ti.template(), value: ti.template()):
+        """Weight of neighbour m for a point ``u`` behind the middle one; then of its derivatives, in turn."""
+        at = Value.SPLINE + m * taps
+        w = ti.cast(value[at + taps - 1], real)
+        weight = V(w)
+        for k in range(1, taps):
+            weight = weight * u + ti.cast(value[at + taps - 1 - k], real)
+        return weight
 
     @ti.func
     def warp(
@@ -104,6 +105,8 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
         """Value and derivatives, to the second, of every image at one vector of samples."""
         groups, pitch = size[Size.SAMPLE_GROUPS], size[Size.PITCH]
         farthest = ti.cast(value[Value.LIMIT], real)
+        # One place for all vectors of samples, unless they are warped at once.
+        weights = slot.real + size[Size.SPLINES] + group * ti.static(6 * taps if spec.gpu else 0)
         x, y = sample[group], sample[groups + group]
         for k in range(size[Size.IMAGES]):
             at = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
@@ -114,6 +117,9 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
             fx, fy = ti.floor(ix), ti.floor(iy)
             u, v = ix - fx, iy - fy
             corner = (fy - reach) * ti.cast(pitch, real) + (fx - reach)
+            for m in range(3 * taps):
+                S[weights + m] = spline(m, u, value)
+                S[weights + 3 * taps + m] = spline(m, v, value)
             val, gx, gy, gxx, gxy, gyy = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
             worst = V(0.0)
             for row in range(taps):
@@ -127,16 +133,16 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
                         for i in ti.static(range(lanes)):
                             c[i] = coef[((first + ti.cast(corner[i], ti.i32)) & NO_WRAP) + col]
                     worst = ti.max(worst, c)
-                    along = along + spline(col, 0, u, value) * c
-                    slope = slope + spline(col, 1, u, value) * c
-                    bend = bend + spline(col, 2, u, value) * c
-                b0, b1 = spline(row, 0, v, value), spline(row, 1, v, value)
-                val = val + b0 * along
-                gx = gx + b0 * slope
-                gxx = gxx + b0 * bend
-                gy = gy + b1 * along
-                gxy = gxy + b1 * slope
-                gyy = gyy + spline(row, 2, v, value) * along
+                    along = along + S[weights + col] * c
+                    slope = slope + S[weights + taps + col] * c
+                    bend = bend + S[weights + 2 * taps + col] * c
+                b = weights + 3 * taps + row
+                val = val + S[b] * along
+                gx = gx + S[b] * slope
+                gxx = gxx + S[b] * bend
+                gy = gy + S[b + taps] * along
+                gxy = gxy + S[b + taps] * slope
+                gyy = gyy + S[b + 2 * taps] * along
             seen = (worst < V(0.1 * NOTHING)) & (inside > V(0.5))
             to = slot.real + size[Size.SEEN] + DERIVATIVES * k * groups + group
             S[to] = ti.select(seen, val, V(NOTHING))

@@ -47,6 +47,7 @@ class Size(IntEnum):
     BLUR = auto()  # [3, sample groups]: second derivatives of the texture
     WEIGHT = auto()
     SCRATCH = auto()  # [2 SHIFTS, sample groups]
+    SPLINES = auto()  # [2, 3, taps]: weights of the neighbours along x and y, and their derivatives
     WARP = auto()  # [images, Warp.N] numbers
     # Regions of the second, in image vectors.
     MOVES = auto()  # [SHIFTS, unknowns, groups]: what a step of an unknown does to the functions

@@ -126,6 +126,7 @@ def _sizes(plan: Refinement, lanes: int, gpu: bool) -> tuple[NDArray[np.int32], 
         Size.SEEN: DERIVATIVES * k * groups, Size.VALUES: k * groups, Size.TEXTURE: groups, Size.BEFORE: groups,
         Size.FUNCTION: FUNCTIONS * groups, Size.BLUR: 3 * groups, Size.WEIGHT: groups,
         Size.SCRATCH: 2 * SHIFTS * groups, Size.WARP: warps,
+        Size.SPLINES: 6 * (plan.degree + 1) * (groups if gpu else 1),
     })  # fmt: skip
     slot_precise = _lay_out(size, {
         Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
