@@ -21,7 +21,8 @@ from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
 from leafflow_ti.reading import Box, Reader
-from leafflow_ti.refinement import PARAMETERS, Place, refine_maps
+from leafflow_ti.refine_plan import Effort
+from leafflow_ti.refinement import PARAMETERS, Place, refine_maps, refine_middle
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import View
 from leafflow_ti.stages.prefilter import Prefilter
@@ -68,6 +69,8 @@ class Pipeline:
         self._cols = self._measurable("x", self._x, capture.width, 0)
         inputs = (*(INPUTS if plan.differences else ()), *(PARAMETERS if plan.refine else ()))
         self._names = tuple(dict.fromkeys((*(n for n in plan.names if not n.startswith("growth")), *inputs)))
+        self.effort = Effort()
+        """Of the refinement in all units so far."""
         self._measured = {*plan.measured, *(INPUTS if plan.differences else ())}
 
     def warm_up(self) -> float:
@@ -90,25 +93,34 @@ class Pipeline:
         plan = self.plan
         band = Band.of(plan.problem.sampling, 1, 1, plan.x.step)
         engine = self._make_engine(band)
-        shape = (len(plan.cameras[0]), len(plan.cameras[1]), band.in_rows, band.in_cols)
+        read = engine.ranges.outer if engine.ranges else band
         if engine.ranges:
-            shape = (*shape[:2], engine.ranges.outer.in_rows, engine.ranges.outer.in_cols)
             engine.ranges.move(engine.estimate.view, (0, 0))
-        grey = np.random.default_rng(0).random(shape).astype(self.device.real("storage"))
+        halo, shape = engine.widening, (len(plan.cameras[0]), len(plan.cameras[1]), read.in_rows, read.in_cols)
+        wide = np.random.default_rng(0).random((*shape[:2], shape[2] + 2 * halo, shape[3] + 2 * halo))
+        wide = wide.astype(self.device.real("storage"))
+        grey = np.ascontiguousarray(wide[:, :, halo : halo + shape[2], halo : halo + shape[3]])
         ok = np.ones(shape[2:], bool)
 
         def one_more() -> Any:
+            if engine.refine:
+                engine.refine.push(wide, np.ones(wide.shape, bool))
             sample = Sample(grey, ok, np.zeros(shape[2:], np.uint8))
             if engine.ranges:
                 sample = engine.ranges.sample(plan.frames[0], grey, ok, ok)
             return engine.push(sample)
 
+        def estimate(tensors: Any) -> None:
+            engine.estimate(tensors)
+            if engine.refine:
+                refine_middle(engine.refine)
+
         while (tensors := one_more()) is None:
             pass
-        engine.estimate(tensors)
+        estimate(tensors)
         if trace is not None:
             with active(trace):
-                engine.estimate(one_more())
+                estimate(one_more())
         self.device.synchronize()
 
     def run(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
@@ -257,7 +269,7 @@ class Pipeline:
             framed.update({name: values.astype(np.float32) for name, values in growth.items()})
         if stay is not None and stay.engine.refine and plan.refine:
             place = Place(y, x, (stay.wide.y, stay.wide.x), plan.geometry)
-            refine_maps(stay.engine.refine, plan.refine, framed, codes, place)
+            self.effort += refine_maps(stay.engine.refine, plan.refine, framed, codes, place)
         unit = plan.y[plan.band(band)]
         inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
         return {n: framed[n][inner].copy() for n in plan.names}, codes[inner].copy()

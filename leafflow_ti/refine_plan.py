@@ -82,6 +82,31 @@ class Refinement:
         )
 
 
+@dataclass(frozen=True)
+class Effort:
+    """What refining took: ``refined`` pixels, those tried twice twice; ``passes`` over the window, one a step; in how
+    many of them all images were sampled (``samplings``): in the first, and where the warps had moved since.
+
+    Fractions: per output pixel.
+    """
+
+    refined: float = 0
+    passes: float = 0
+    samplings: float = 0
+
+    @classmethod
+    def most(cls, plan: Refinement) -> Effort:
+        """Of one pixel, at most, tried once."""
+        return cls(1, plan.steps, plan.steps)
+
+    def __add__(self, other: Effort) -> Effort:
+        return Effort(self.refined + other.refined, self.passes + other.passes, self.samplings + other.samplings)
+
+    def per(self, pixels: float) -> Effort:
+        """The share of one of so many output pixels."""
+        return Effort(self.refined / pixels, self.passes / pixels, self.samplings / pixels)
+
+
 def samples_across(size: int, thin: int) -> int:
     """Samples along one axis of a window of ``size`` pixels: every ``thin``-th around its centre."""
     return 2 * (size // 2 // thin) + 1

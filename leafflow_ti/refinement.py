@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.capture import Geometry
 from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
-from leafflow_ti.refine_plan import Refinement
+from leafflow_ti.refine_plan import Effort, Refinement
 from leafflow_ti.stages.refine import Refined, RefineStage
 from leafflow_ti.status import HAS_VALUE, Status
 
@@ -41,24 +41,25 @@ class Place:
         return np.stack([x - self.geometry.principal_px[0], y - self.geometry.principal_px[1]], axis=1).astype(float)
 
 
-def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place) -> None:
-    """Refine every pixel that has a value, in place of ``maps`` [rows, cols] and ``status``.
+def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place) -> Effort:
+    """Refine every pixel that has a value, in place of ``maps`` [rows, cols] and ``status``; returns what it took.
 
     ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at.
     """
     rows, cols = np.nonzero(np.isin(status, HAS_VALUE))
     if not rows.size:
-        return
+        return Effort()
     start = np.zeros((rows.size, _GROWTH + 3))
     for i, name in enumerate(PARAMETERS):
         if name in maps:
             start[:, i] = np.nan_to_num(maps[name][rows, cols])
     found = _call(stage, place, rows, cols, start)
-    good = found.converged
+    good, effort = found.converged, found.effort
     parameters, covariance = found.parameters, found.covariance
     again, begin = _neighbours(rows, cols, found, place, status.shape)
     if again.size:
         second = _call(stage, place, rows[again], cols[again], begin)
+        effort += second.effort
         better = again[second.converged]
         parameters[better], covariance[better] = (
             second.parameters[second.converged], second.covariance[second.converged]
@@ -76,6 +77,14 @@ def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArra
         for full, found_values in ((name, values), (f"{name}_std", std)):
             if full in maps:
                 maps[full][rows, cols] = found_values
+    return effort
+
+
+def refine_middle(stage: RefineStage) -> Refined:
+    """Refine the pixel in the middle of the block from a start that means nothing: a frontal plane at rest."""
+    start = np.zeros((1, _GROWTH + 3))
+    start[:, 0] = 1.0
+    return stage(np.array([stage.rows // 2]), np.array([stage.cols // 2]), np.zeros((1, 2)), start)
 
 
 def _call(stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array) -> Refined:

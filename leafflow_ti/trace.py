@@ -33,11 +33,13 @@ STAGES: dict[str, str] = {
     "solve": "null space and covariances",
     "fit": "geometry, motion, maps",
     "estimate": "null space to maps, where they are one launch",
+    "splines": "spline coefficients of the images for the refinement",
+    "refine": "Gauss-Newton on the grey values of all images",
     "write": "maps to disk",
     "host": "all else of the thread that computes",
 }
 """Name of a stage -> what its seconds are spent on."""
-DEVICE_STAGES = frozenset(("prefilter", "filter", "tensor", "solve", "fit", "estimate"))
+DEVICE_STAGES = frozenset(("prefilter", "filter", "tensor", "solve", "fit", "estimate", "splines", "refine"))
 BACKGROUND_STAGES = frozenset(("read", "decode", "write"))
 """What other threads do while the device computes."""
 

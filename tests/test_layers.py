@@ -27,6 +27,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("stages",), 5),
     **dict.fromkeys(("growth", "refinement"), 5),
     **dict.fromkeys(("bands", "model_plan", "plan", "reading", "engines", "pipeline", "results", "work"), 6),
+    **dict.fromkeys(("refinement", "refine_work"), 6),
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases"), 7),
     **dict.fromkeys(("cli",), 8),

@@ -74,7 +74,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
                 samples.gram(slot, i, size, S, p)
             for i in range(size[Size.IMAGES]):
                 samples.sums(slot, i, size, value, sample, S, r, p)
-            solver.solve(slot, size, value, image, P, p)
+            solver.solve(slot, size, value, P, p)
         for i in range(size[Size.IMAGES]):
             samples.halves(slot, i, size, value, sample, S, r, p)
         for i in range(SHIFTS):
@@ -121,7 +121,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
             elif ti.static(stage == Stage.SUMS):
                 samples.sums(slot, i, size, value, sample, S, r, p)
             elif ti.static(stage == Stage.SOLVE):
-                solver.solve(slot, size, value, image, P, p)
+                solver.solve(slot, size, value, P, p)
 
     @lane_kernel(lanes)
     def refine(

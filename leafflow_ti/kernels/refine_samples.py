@@ -19,6 +19,9 @@ NO_WRAP = 0x3FFFFFFF
 """Elements of the coefficients lie below. An index that is known to be positive and small needs no extension of its own
 for each neighbour: measured, three quarters of the time of an interpolation."""
 
+MOST_IMAGES = 0.8
+"""Share of the images that must show a sample where light is fitted."""
+
 
 @functools.cache
 def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
@@ -198,8 +201,13 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
         some = ti.select(mass > V(1e-6), V(1.0), V(0.0))
         scale = some / ti.max(mass, V(1e-6))
         if not limit > 0.0:
-            # What no image shows is no part of the window.
-            S[slot.real + size[Size.WEIGHT] + group] = S[slot.real + size[Size.WEIGHT] + group] * some
+            # What no image shows is no part of the window; nor, where light is fitted, what many do not: its terms
+            # would be fitted to different parts of the window in different images.
+            enough = some
+            if terms > 0:
+                most = ti.cast(size[Size.IMAGES], real) * ti.cast(MOST_IMAGES, real)
+                enough = ti.select(mass > V(most), V(1.0), V(0.0))
+            S[slot.real + size[Size.WEIGHT] + group] = S[slot.real + size[Size.WEIGHT] + group] * enough
         old = slot.real + size[Size.SCRATCH] + group
         S[old], S[old + groups], S[old + 2 * groups] = bxx, bxy, byy
         to = slot.real + size[Size.FUNCTION] + group

@@ -39,6 +39,8 @@ TOLERATED = 0.03
 """Pixels of misplacement whose residual is no reason to trust an image or a sample less."""
 TUKEY = 6.0
 """Standard deviations beyond which a sample has no weight."""
+WHOLE = 0.97
+"""Share of the window that an image must show to take part where light is fitted."""
 CONVERGED = 0.01
 """Square of a step, in standard errors, that ends the iteration."""
 LAST_STEP = 1.0
@@ -125,8 +127,9 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.ACCEPTED + i] = start[at + 2 + i]
         for i in range(Scalar.COST, Scalar.ROBUST + 1):
             p[s + i] = precise(0.0)
-        p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
+        p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT], p[s + Scalar.SAMPLINGS] = precise(1.0), precise(0.0), precise(0.0)
         for g in range(groups):
+            P[slot.precise + size[Size.KEPT] + g] = image[Image.PRESENT * groups + g]
             P[slot.precise + size[Size.TRUST] + g] = image[Image.PRESENT * groups + g]
             for m in range(TERMS):
                 P[slot.precise + size[Size.GAIN] + m * groups + g] = V(0.0)
@@ -173,11 +176,16 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             P[slot.precise + size[Size.ENERGY] + g] = ti.max(energy - lit / share, 1e-6 * energy)
 
     @ti.func
-    def weigh(slot: ti.template(), size: ti.template(), image: ti.template(), P: ti.template(), p: ti.template()):
+    def weigh(slot: ti.template(), size: ti.template(), P: ti.template(), p: ti.template()):
         """Cost of the pass, and the weights of the images from their residuals, against the harmonic mean of these."""
         s, groups = scalars(slot, size), size[Size.IMAGE_GROUPS]
         energy, mass, inverse, counted = precise(0.0), precise(0.0), precise(0.0), precise(0.0)
         whole = p[s + Scalar.MASS]
+        if p[s + Scalar.PASSES] < 1.5 and size[Size.TERMS] > 0:
+            for g in range(groups):
+                seen = ti.select(P[slot.precise + size[Size.MASS] + g] > V(WHOLE * whole), V(1.0), V(0.0))
+                P[slot.precise + size[Size.KEPT] + g] = P[slot.precise + size[Size.KEPT] + g] * seen
+                P[slot.precise + size[Size.TRUST] + g] = P[slot.precise + size[Size.TRUST] + g] * seen
         for g in range(groups):
             e, m = P[slot.precise + size[Size.ENERGY] + g], P[slot.precise + size[Size.MASS] + g]
             trust = P[slot.precise + size[Size.TRUST] + g]
@@ -193,7 +201,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             e, m = P[slot.precise + size[Size.ENERGY] + g], P[slot.precise + size[Size.MASS] + g]
             bound = V(OUTLYING * typical) * m / ti.max(e, V(1e-30))
             share = ti.min(bound, V(1.0))
-            P[slot.precise + size[Size.TRUST] + g] = image[Image.PRESENT * groups + g] * share * share
+            P[slot.precise + size[Size.TRUST] + g] = P[slot.precise + size[Size.KEPT] + g] * share * share
 
     @ti.func
     def photometry(slot: ti.template(), size: ti.template(), p: ti.template()):
@@ -410,18 +418,16 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.DONE], p[s + Scalar.CODE] = precise(1.0), singular
 
     @ti.func
-    def solve(
-        slot: ti.template(), size: ti.template(), value: ti.template(), image: ti.template(), P: ti.template(),
-        p: ti.template(),
-    ):  # fmt: skip
+    def solve(slot: ti.template(), size: ti.template(), value: ti.template(), P: ti.template(), p: ti.template()):
         """Judge the pass, and go a step further, or half a step back; the pass after the last one only judges."""
         s = scalars(slot, size)
         p[s + Scalar.PASSES] += 1.0
+        p[s + Scalar.SAMPLINGS] += p[s + Scalar.RESAMPLE]
         passes = ti.cast(p[s + Scalar.PASSES], ti.i32)
         # The cost is that of the best photometric terms: without them a change of light would count as noise.
         photometry(slot, size, p)
         leave_light_out(slot, size, P, p)
-        weigh(slot, size, image, P, p)
+        weigh(slot, size, P, p)
         cost = p[s + Scalar.COST]
         if passes == 1:
             p[s + Scalar.START] = cost
@@ -479,6 +485,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
         s, n = scalars(slot, size), size[Size.UNKNOWNS]
         to = pixel * Out.N
         out[to + Out.CODE], out[to + Out.PASSES] = p[s + Scalar.CODE], p[s + Scalar.PASSES]
+        out[to + Out.SAMPLINGS] = p[s + Scalar.SAMPLINGS]
         out[to + Out.START], out[to + Out.COST] = p[s + Scalar.START], p[s + Scalar.COST]
         for i in range(MAX_UNKNOWNS):
             out[to + Out.Q + i] = p[s + Scalar.Q + i]

@@ -54,6 +54,7 @@ class Size(IntEnum):
     ENERGY = auto()  # [groups]: squared residual
     MASS = auto()  # [groups]: weight of the valid samples
     TRUST = auto()  # [groups]: weight of an image
+    KEPT = auto()  # [groups]: 1, or 0 for an image that does not take part
     GAIN = auto()  # [TERMS, groups]
     GAIN_STEP = auto()  # [TERMS, groups]
     HOMOGRAPHY = auto()  # [Warp.GAIN, groups]
@@ -155,6 +156,7 @@ class Scalar(IntEnum):
     EFFECTIVE = 1346  # samples of equal weight that the window stands for
     RESAMPLE = 1347  # whether the images are sampled in this pass
     DRIFT = 1348  # px that the warps have moved since
+    SAMPLINGS = 1349  # passes in which they were
     N = 1360
 
 
@@ -173,6 +175,7 @@ class Out(IntEnum):
 
     CODE = 0
     PASSES = auto()
+    SAMPLINGS = auto()
     START = auto()  # mean squared residual of the start
     COST = auto()
     Q = auto()  # [MAX_UNKNOWNS]

@@ -9,18 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.refine_plan import Refinement
+from leafflow_ti.refine_plan import Effort, Refinement
 from leafflow_ti.runtime import Device
 from leafflow_ti.splines import filter_radius, filter_taps
 from leafflow_ti.stages.estimate_tables import View
 from leafflow_ti.stages.planes import Filtering, round_up
-from leafflow_ti.stages.refine_tables import RefineTables
+from leafflow_ti.stages.refine_tables import RefineTables, Workspaces
 from leafflow_ti.trace import span
 
 Array = NDArray[Any]
 
-GPU_BYTES = 1 << 30
-"""Workspace of the pixels of one launch on a GPU."""
 LAUNCH_SECONDS = 0.3
 """Of a launch on the CPU, about: an interrupt is noticed only between two."""
 SAMPLES_PER_SECOND = 5e7
@@ -34,16 +32,23 @@ class Refined:
     """What became of some pixels [n]; see ``kernels.refine_tables.Code``.
 
     ``parameters`` [n, 15]: Z0, ZX, ZY, N, Ω, A, growth rates (0 where not estimated); ``covariance`` [n, 15, 15], 0
-    where not estimated, -1 where the data do not determine an unknown. ``passes``: evaluations of the images; ``start``
-    and ``cost``: mean squared residual before and after.
+    where not estimated, -1 where the data do not determine an unknown. ``passes``: evaluations of the residual;
+    ``samplings``: those for which the images were interpolated anew; ``start`` and ``cost``: mean squared residual
+    before and after.
     """
 
     code: NDArray[np.int64]
     passes: NDArray[np.int64]
+    samplings: NDArray[np.int64]
     start: Array
     cost: Array
     parameters: Array
     covariance: Array
+
+    @property
+    def effort(self) -> Effort:
+        """What it took."""
+        return Effort(len(self.passes), int(self.passes.sum()), int(self.samplings.sum()))
 
     @property
     def converged(self) -> NDArray[np.bool_]:
@@ -71,26 +76,20 @@ class RefineStage:
         self._mask: Any = None
         lanes = device.dense.lanes
         tables = RefineTables.of(plan, view, lanes, self.pitch, device.gpu)
-        self.size, self._slot_real, self._slot_precise = tables.size, tables.slot_real, tables.slot_precise
+        self.size = tables.size
         self._tables = (
             device.array(tables.size, "int"), device.array(tables.value, "algebra"),
             device.vectors(device.array(tables.image, "algebra"), lanes),
         )  # fmt: skip
         self._samples = device.vectors(device.array(tables.sample), lanes)
-        bytes_per_slot = lanes * (
-            tables.slot_real * np.dtype(device.real("storage")).itemsize
-            + tables.slot_precise * np.dtype(device.real("algebra")).itemsize
-        )
-        if device.gpu:
-            self._batch = max(1, GPU_BYTES // bytes_per_slot)
-            slots = self._batch
-        else:
-            slots = 8 * device.threads
+        storage, algebra = (np.dtype(device.real(kind)).itemsize for kind in ("storage", "algebra"))
+        space = Workspaces.of(plan, lanes, (storage, algebra), device.gpu, device.threads)
+        self._batch = self._slots_n = space.slots
+        if not device.gpu:
             samples = n * n_frames * plan.across**2 * (plan.steps + 1)
-            self._batch = max(slots, int(LAUNCH_SECONDS * device.threads * SAMPLES_PER_SECOND / samples))
-        self._real = device.zeros(slots * tables.slot_real * lanes)
-        self._precise = device.zeros(slots * tables.slot_precise * lanes, "algebra")
-        self._slots_n = slots
+            self._batch = max(space.slots, int(LAUNCH_SECONDS * device.threads * SAMPLES_PER_SECOND / samples))
+        self._real = device.zeros(space.slots * space.real * lanes)
+        self._precise = device.zeros(space.slots * space.precise * lanes, "algebra")
 
     def reset(self) -> None:
         """Forget all frames."""
@@ -166,10 +165,10 @@ class RefineStage:
             )  # fmt: skip
             for first in range(0, n, self._batch):
                 self._launch(first, min(self._batch, n - first), arguments)
-            found = np.array(device.host(out), float).reshape(n, Out.N)
+            found = np.asarray(device.host(out), float).reshape(n, Out.N)
+        code, passes, samplings = (found[:, k].astype(np.int64) for k in (Out.CODE, Out.PASSES, Out.SAMPLINGS))
         return Refined(
-            found[:, Out.CODE].astype(np.int64), found[:, Out.PASSES].astype(np.int64), found[:, Out.START],
-            found[:, Out.COST], found[:, Out.Q : Out.COVARIANCE],
+            code, passes, samplings, found[:, Out.START], found[:, Out.COST], found[:, Out.Q : Out.COVARIANCE],
             found[:, Out.COVARIANCE :].reshape(n, Out.COVARIANCE - Out.Q, Out.COVARIANCE - Out.Q),
         )  # fmt: skip
 

@@ -14,17 +14,24 @@ from leafflow_ti.stages.estimate_tables import View
 
 Array = NDArray[Any]
 
+CPU_BYTES = 256 << 20
+"""Workspaces on the CPU, if one for every thread does not take more."""
+SLOTS_PER_THREAD = 8
+"""Tasks that the pixels of a launch are cut into where memory allows: some take longer than others."""
+GPU_BYTES = 1 << 30
+"""Workspaces of the pixels of one launch on a GPU."""
+DERIVED = 80
+"""Numbers of derived maps, their errors, and what they are made of, per pixel."""
+
 
 @dataclass(frozen=True)
 class RefineTables:
-    """Tables of the kernels on the host, and the sizes of a pixel's workspaces in vectors."""
+    """Tables of the kernels on the host."""
 
     size: NDArray[np.int32]
     value: Array
     image: Array
     sample: Array
-    slot_real: int
-    slot_precise: int
 
     @classmethod
     def of(cls, plan: Refinement, view: View, lanes: int, pitch: int, gpu: bool) -> RefineTables:
@@ -32,48 +39,14 @@ class RefineTables:
 
         ``lanes``: samples, or images, of a vector; ``gpu``: the warps of all images are made at once.
         """
-        from leafflow_ti.kernels.refine_tables import (
-            DERIVATIVES,
-            FUNCTIONS,
-            SHIFTS,
-            TERMS,
-            Geometry,
-            Image,
-            Scalar,
-            Size,
-            Value,
-            Warp,
-        )  # fmt: skip
+        from leafflow_ti.kernels.refine_tables import Image, Size, Value
 
-        unknowns = _unknowns(plan)
-        n, k = len(unknowns), len(plan.frames) * len(plan.cameras)
-        images = -(-k // lanes)
-        offsets = plan.thin * (np.arange(plan.across) - plan.across // 2)
-        n_samples = plan.across**2
-        groups = -(-n_samples // lanes)
-        size = np.zeros(Size.LIST + n, np.int32)
-        size[Size.LIST :] = unknowns
+        size, _, _ = _sizes(plan, lanes, gpu)
         correlation = _noise_correlation(plan.thin, plan.degree)
-        for name, entry in {
-            Size.UNKNOWNS: n, Size.MODES: plan.modes, Size.TERMS: plan.terms, Size.IMAGES: k,
-            Size.IMAGE_GROUPS: images, Size.SAMPLES: n_samples, Size.SAMPLE_GROUPS: groups, Size.ACROSS: plan.across,
-            Size.STEPS: plan.steps, Size.PITCH: pitch, Size.NEIGHBOURS: len(correlation) - 1,
-        }.items():  # fmt: skip
-            size[name] = entry
-        warps = -(-k * Warp.N // lanes)
-        slot_real = _lay_out(size, {
-            Size.SEEN: DERIVATIVES * k * groups, Size.VALUES: k * groups, Size.TEXTURE: groups, Size.BEFORE: groups,
-            Size.FUNCTION: FUNCTIONS * groups, Size.BLUR: 3 * groups, Size.WEIGHT: groups,
-            Size.SCRATCH: 2 * SHIFTS * groups, Size.WARP: warps,
-        })  # fmt: skip
-        slot_precise = _lay_out(size, {
-            Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
-            Size.TRUST: images, Size.GAIN: TERMS * images, Size.GAIN_STEP: TERMS * images,
-            Size.HOMOGRAPHY: Warp.GAIN * images, Size.PRODUCT: SHIFTS, Size.NORMAL: n * (n + 1) // 2, Size.RIGHT: n,
-            Size.HALVES: 2 * SHIFTS * images,
-            Size.SCALAR: -(-Scalar.N // lanes), Size.GEOMETRY: Geometry.N * (images if gpu else 1),
-        })  # fmt: skip
-        size[Size.SLOT_REAL], size[Size.SLOT_PRECISE] = slot_real, slot_precise
+        size[Size.PITCH], size[Size.NEIGHBOURS] = pitch, len(correlation) - 1
+        k, n_samples = size[Size.IMAGES], size[Size.SAMPLES]
+        images, groups = size[Size.IMAGE_GROUPS], size[Size.SAMPLE_GROUPS]
+        offsets = plan.thin * (np.arange(plan.across) - plan.across // 2)
 
         sample = np.zeros((3, groups * lanes))
         sample[0, :n_samples], sample[1, :n_samples] = np.tile(offsets, plan.across), np.repeat(offsets, plan.across)
@@ -97,7 +70,72 @@ class RefineTables:
         value[Value.CORRELATION] = both**2 * np.sum(sample[2] ** 2) / np.sum(sample[2])
         value[Value.CORRELATION_AT :][: correlation.size] = correlation
         value[Value.SPLINE :] = pieces
-        return cls(size, value, image, sample, slot_real, slot_precise)
+        return cls(size, value, image, sample)
+
+
+@dataclass(frozen=True)
+class Workspaces:
+    """``slots`` pixels are worked on at once; of each the workspaces are ``real`` and ``precise`` vectors long."""
+
+    slots: int
+    real: int
+    precise: int
+    slot_bytes: int
+
+    @property
+    def bytes(self) -> int:
+        """All of them."""
+        return self.slots * self.slot_bytes
+
+    @classmethod
+    def of(cls, plan: Refinement, lanes: int, itemsize: tuple[int, int], gpu: bool, threads: int) -> Workspaces:
+        """``itemsize``: bytes of a number of images and of algebra; ``threads`` of the CPU, which have one at least."""
+        _, real, precise = _sizes(plan, lanes, gpu)
+        slot_bytes = lanes * (real * itemsize[0] + precise * itemsize[1])
+        if gpu:
+            return cls(max(1, GPU_BYTES // slot_bytes), real, precise, slot_bytes)
+        slots = max(threads, min(SLOTS_PER_THREAD * threads, CPU_BYTES // slot_bytes))
+        return cls(slots, real, precise, slot_bytes)
+
+
+def bytes_per_pixel() -> int:
+    """Of one output pixel on the host: start, position, results as they are written and as they are handed on (two
+    copies of all covariances), and the maps that are derived from them."""
+    from leafflow_ti.kernels.refine_tables import MAX_UNKNOWNS, Out
+
+    return 8 * (2 * (MAX_UNKNOWNS + 2) + 2 * Out.N + DERIVED)
+
+
+def _sizes(plan: Refinement, lanes: int, gpu: bool) -> tuple[NDArray[np.int32], int, int]:
+    """The table ``size`` but for the images' pitch and the noise, and the vectors of a pixel's two workspaces."""
+    from leafflow_ti.kernels.refine_tables import DERIVATIVES, FUNCTIONS, SHIFTS, TERMS, Geometry, Scalar, Size, Warp
+
+    unknowns = _unknowns(plan)
+    n, k = len(unknowns), len(plan.frames) * len(plan.cameras)
+    images, groups = -(-k // lanes), -(-(plan.across**2) // lanes)
+    size = np.zeros(Size.LIST + n, np.int32)
+    size[Size.LIST :] = unknowns
+    for name, entry in {
+        Size.UNKNOWNS: n, Size.MODES: plan.modes, Size.TERMS: plan.terms, Size.IMAGES: k,
+        Size.IMAGE_GROUPS: images, Size.SAMPLES: plan.across**2, Size.SAMPLE_GROUPS: groups,
+        Size.ACROSS: plan.across, Size.STEPS: plan.steps,
+    }.items():  # fmt: skip
+        size[name] = entry
+    warps = -(-k * Warp.N // lanes)
+    slot_real = _lay_out(size, {
+        Size.SEEN: DERIVATIVES * k * groups, Size.VALUES: k * groups, Size.TEXTURE: groups, Size.BEFORE: groups,
+        Size.FUNCTION: FUNCTIONS * groups, Size.BLUR: 3 * groups, Size.WEIGHT: groups,
+        Size.SCRATCH: 2 * SHIFTS * groups, Size.WARP: warps,
+    })  # fmt: skip
+    slot_precise = _lay_out(size, {
+        Size.MOVES: SHIFTS * n * images, Size.SUMS: FUNCTIONS * images, Size.ENERGY: images, Size.MASS: images,
+        Size.TRUST: images, Size.KEPT: images, Size.GAIN: TERMS * images, Size.GAIN_STEP: TERMS * images,
+        Size.HOMOGRAPHY: Warp.GAIN * images, Size.PRODUCT: SHIFTS, Size.NORMAL: n * (n + 1) // 2, Size.RIGHT: n,
+        Size.HALVES: 2 * SHIFTS * images,
+        Size.SCALAR: -(-Scalar.N // lanes), Size.GEOMETRY: Geometry.N * (images if gpu else 1),
+    })  # fmt: skip
+    size[Size.SLOT_REAL], size[Size.SLOT_PRECISE] = slot_real, slot_precise
+    return size, slot_real, slot_precise
 
 
 def _unknowns(plan: Refinement) -> list[int]:
