@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from refine_bench import SCENE, Case, X, Y, at_pixels, covariance, estimated
 
+from leafflow_ti.refinement import _derived
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.refine import Refined
 from leafflow_ti.synthetic.moving_patch import true_state
@@ -114,6 +115,29 @@ def test_error_bars_are_the_scatter(device: Start, options: dict[str, Any], nois
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.06)
     assert np.mean(np.abs(z) < 1.0) == pytest.approx(0.683, abs=0.05)
     assert np.mean(np.abs(z) < 1.96) == pytest.approx(0.95, abs=0.03)
+
+
+def test_what_images_do_not_determine_has_no_error_bar(device: Start) -> None:
+    """Growth from one moment: the rest is as without it, and the growth is not there."""
+    still = replace(SCENE, n_frames=1)
+    case, without = Case(still, motion=0, modes=3), Case(still, motion=0)
+    found, wanted = case.refine(device("f64")), without.refine(device("f64"))
+    assert found.converged.all()
+    np.testing.assert_allclose(found.parameters[0], wanted.parameters[0], rtol=1e-9)
+    np.testing.assert_allclose(covariance(found, case)[:3, :3], covariance(wanted, without), rtol=1e-6)
+    assert (covariance(found, case)[3:] == -1).all()
+    maps = _derived(case.plan, found.parameters, found.covariance, np.zeros((1, 2)), still.f_px)
+    for name in ("growth_rate", "strain_rate_11", "strain_rate_22", "strain_rate_12"):
+        value, std = maps[name]
+        assert np.isnan(value).all()
+        assert np.isinf(std).all()
+    assert np.isfinite(maps["depth"]).all()
+
+
+def test_what_shows_nothing_is_not_refined(device: Start) -> None:
+    """No texture at all; and motion that one moment does not show."""
+    assert not Case(replace(SCENE, amplitude=0.0), modes=1).refine(device("f64")).converged.any()
+    assert not Case(replace(SCENE, n_frames=1), motion=9).refine(device("f64")).converged.any()
 
 
 # --- masks, holes, borders -------------------------------------------------------------------------------------------
