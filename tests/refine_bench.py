@@ -45,7 +45,8 @@ X, Y = 53, 46
 
 @dataclass(frozen=True)
 class Case:
-    """A scene and how it is refined; ``motion``, ``modes``, ``terms``, ``steps`` as of ``Refinement``."""
+    """A scene and how it is refined; ``motion``, ``modes``, ``terms``, ``steps``, ``degree`` as of
+    ``Refinement``."""
 
     scene: PlaneScene = SCENE
     size: int = 33
@@ -55,6 +56,7 @@ class Case:
     modes: int = 0
     terms: int = 0
     steps: int = 12
+    degree: int = 5
 
     @property
     def plan(self) -> Refinement:
@@ -62,7 +64,7 @@ class Case:
         middle = scene.n_frames // 2
         return Refinement(
             self.steps, self.size, self.sigma, self.thin, tuple(range(-middle, scene.n_frames - middle)),
-            self.cameras, self.motion, self.modes, self.terms,
+            self.cameras, self.motion, self.modes, self.terms, degree=self.degree,
         )  # fmt: skip
 
     @property

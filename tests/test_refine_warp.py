@@ -43,7 +43,7 @@ def warps_of(device: Device, case: Case, state: np.ndarray) -> tuple[np.ndarray,
     view = View(scene.f_px, scene.principal, scene.baseline_mm, SHIFT, 0, 0, 1, 1, 1, 1)
     tables = RefineTables.of(case.plan, view, spec.lanes, 64, device.gpu)
     size, lanes = tables.size, spec.lanes
-    numbers = device.zeros(tables.slot_precise * lanes, "algebra")
+    numbers = device.zeros(size[Size.SLOT_PRECISE] * lanes, "algebra")
     first = size[Size.SCALAR] * lanes
     numbers[first + Scalar.Q : first + Scalar.Q + 15] = state
     numbers[first + Scalar.X0 : first + Scalar.Y0 + 1] = np.array([X, Y]) - scene.principal

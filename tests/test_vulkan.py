@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ import pytest
 import test_kernels_tensor
 import test_range_flow
 from reference import chain, patch
+from refine_bench import SCENE, Case, covariance, estimated
 from test_prefilter import assert_equals_twin
 from tolerances import SOLVERS, tolerance
 
@@ -51,7 +53,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(PREFILTERS) + 6} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(PREFILTERS) + 7} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -123,3 +125,22 @@ def on_vulkan_the_solvers_agree(bench: Callable) -> None:
         std = np.sqrt([np.diag(cov[k, k]) for k in range(b.columns.n_time_like)])
         assert np.max(np.abs(fast.parameters[pixel] - full.parameters[pixel]) / std) <= SOLVERS
         assert np.max(np.abs(full.parameters[pixel] - P.T) / std) <= tolerance(b.device).parameters
+
+
+def on_vulkan_the_refinement_equals_the_twin(device: Callable) -> None:
+    """Every stage a launch of its own; as on the CPU, a step below a tenth of a standard error ends it."""
+    case = Case(replace(SCENE, n_cols=5, n_frames=5, noise=0.1), modes=1, terms=3, steps=6)
+    valid = np.ones(case.images.shape, bool)
+    valid[1, 0, 40] = False
+    found, wanted = case.refine(device("f32")), case.twin()
+    assert found.converged.all()
+    errors = np.sqrt(np.diag(wanted.covariance))
+    assert np.abs(estimated(found.parameters[0] - wanted.state, case) / errors).max() < 0.05
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance(found, case))) / errors, 0.997, atol=0.015)
+    holed = [
+        case.refine(device("f32"), images=np.where(valid, case.images, garbage), valid=valid)
+        for garbage in (0.0, 255.0)
+    ]
+    assert holed[0].converged.all()
+    np.testing.assert_array_equal(holed[0].parameters, holed[1].parameters)
+    assert (holed[0].parameters != found.parameters).any()
