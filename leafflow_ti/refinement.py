@@ -16,7 +16,7 @@ from leafflow_ti.capture import Geometry
 from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
 from leafflow_ti.refine_plan import Effort, Refinement
 from leafflow_ti.stages.refine import Refined, RefineStage
-from leafflow_ti.status import HAS_VALUE, Status
+from leafflow_ti.status import Status
 
 Array = NDArray[Any]
 Maps = dict[str, Array]
@@ -46,7 +46,7 @@ def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArra
 
     ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at.
     """
-    rows, cols = np.nonzero(np.isin(status, HAS_VALUE))
+    rows, cols = np.nonzero(status == Status.OK)
     if not rows.size:
         return Effort()
     start = np.zeros((rows.size, _GROWTH + 3))
@@ -65,8 +65,7 @@ def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArra
             second.parameters[second.converged], second.covariance[second.converged]
         )  # fmt: skip
         good[better] = True
-    kept = ~good & (status[rows, cols] == Status.OK)
-    status[rows[kept], cols[kept]] = Status.UNREFINED
+    status[rows[~good], cols[~good]] = Status.UNREFINED
     rows, cols = rows[good], cols[good]
     derived = _derived(plan, parameters[good], covariance[good], place.rays(rows, cols), place.geometry.f_px)
     if "disparity" in maps:

@@ -61,24 +61,29 @@ class LaneKernel:
     Arrays of vectors must be aligned as ``runtime.Device.empty`` does.
     """
 
-    def __init__(self, function):
+    def __init__(self, function, optimised=True):
         self._kernel = ti.kernel(function)
+        self._settings = {"real_matrix_scalarize": False} | ({} if optimised else {"advanced_optimization": False})
 
     def __call__(self, *arguments):
         config = ti.lang.impl.current_cfg()
-        usual = getattr(config, "real_matrix_scalarize", None)
-        if usual is None:
-            return self._kernel(*arguments)
-        config.real_matrix_scalarize = False
+        usual = {name: getattr(config, name) for name in self._settings if hasattr(config, name)}
+        for name in usual:
+            setattr(config, name, self._settings[name])
         try:
             return self._kernel(*arguments)
         finally:
-            config.real_matrix_scalarize = usual
+            for name, value in usual.items():
+                setattr(config, name, value)
 
 
-def lane_kernel(lanes):
-    """Decorator of kernels that work on ``lane_type`` values: a plain kernel where there is one lane."""
-    return ti.kernel if lanes == 1 else LaneKernel
+def lane_kernel(lanes, optimised=True):
+    """Decorator of kernels that work on ``lane_type`` values: a plain kernel where there is one lane.
+
+    ``optimised`` False: without the engine's own simplification, whose time grows faster than a kernel; of a large one
+    it took two thirds, for no speed, since LLVM simplifies once more.
+    """
+    return ti.kernel if lanes == 1 else functools.partial(LaneKernel, optimised=optimised)
 
 
 __all__ = ["ENGINE", "lane_kernel", "lane_type", "quick_front_end", "ti"]

@@ -81,7 +81,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
             samples.spread_noise(slot, i, size, value, r, p)
         for i in range(SHIFTS):
             samples.noise(slot, i, size, r, p)
-        solver.finish(slot, pixel, size, P, p, out)
+        solver.finish(slot, pixel, size, value, P, p, out)
 
     @ti.func
     def one_stage(
@@ -101,7 +101,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
         elif ti.static(stage == Stage.NOISE):
             samples.noise(slot, i, size, r, p)
         elif ti.static(stage == Stage.FINISH):
-            solver.finish(slot, pixel, size, P, p, out)
+            solver.finish(slot, pixel, size, value, P, p, out)
         elif p[scalars(slot, size) + Scalar.DONE] < 0.5:
             if ti.static(stage == Stage.AIM):
                 warps.aim(slot, size, value, p)
@@ -123,7 +123,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
             elif ti.static(stage == Stage.SOLVE):
                 solver.solve(slot, size, value, P, p)
 
-    @lane_kernel(lanes)
+    @lane_kernel(lanes, optimised=False)
     def refine(
         first: ti.i32,
         n_pixels: ti.i32,

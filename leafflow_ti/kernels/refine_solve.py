@@ -43,9 +43,12 @@ WHOLE = 0.97
 """Share of the window that an image must show to take part where light is fitted."""
 CONVERGED = 0.01
 """Square of a step, in standard errors, that ends the iteration."""
-LAST_STEP = 1.0
-"""The same: how large the last of the allowed steps may be, unless it is much shorter than the first one."""
+LEFT = 0.25
+"""The same of what may be left to go after the last of the allowed steps, if the next ones shrink as this one did."""
 CONTRACTED = 0.1
+"""Share of the square by which a first step is supposed to shrink."""
+NOTHING_MOVED = 1e-3
+"""Pixels by which a step without noise may move the images where one with noise may take a standard error."""
 DOUBTFUL = 4.0
 """Mean square of how much the halves of the window contradict each other, in standard errors, beyond which error bars
 grow with it: the window then holds more than a plane in rigid motion, and its residual is not noise alone."""
@@ -378,6 +381,15 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
                 P[at] = P[at] - P[to]
 
     @ti.func
+    def one_error(slot: ti.template(), size: ti.template(), value: ti.template(), p: ti.template()):
+        """Square of a step by a standard error of every unknown, or of one that moves the images by next to nothing."""
+        s, n = scalars(slot, size), ti.cast(size[Size.UNKNOWNS], precise)
+        # The noise of the sums is correlated and weighted.
+        noise = p[s + Scalar.COST] * value[Value.CORRELATION] * n
+        least = tolerated(slot, size, p) * p[s + Scalar.MASS] * p[s + Scalar.IMAGES]
+        return ti.max(noise, least * (NOTHING_MOVED / TOLERATED) ** 2)
+
+    @ti.func
     def step(slot: ti.template(), size: ti.template(), value: ti.template(), P: ti.template(), p: ti.template()):
         """Solve the normal equations and go one step."""
         s, n = scalars(slot, size), size[Size.UNKNOWNS]
@@ -407,12 +419,14 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.Q + u] = p[s + Scalar.ACCEPTED + u] + p[s + Scalar.STEP + i]
         change_gains(slot, factor, size, P, p)
         p[s + Scalar.BACK] = precise(1.0)
+        # The share of the square by which steps shrink, known from the second one on.
+        shrink = CONTRACTED
+        if p[s + Scalar.LAST] > 0.0:
+            shrink = ti.min(square / p[s + Scalar.LAST], precise(1.0))
         p[s + Scalar.LAST] = square
-        if p[s + Scalar.PASSES] < 1.5:
-            p[s + Scalar.FIRST] = square
-        # In standard errors: the noise of the sums is correlated and weighted.
-        error = p[s + Scalar.COST] * value[Value.CORRELATION] * ti.cast(n, precise)
-        if square < CONVERGED * error and factor > 0.999:
+        ratio = ti.sqrt(shrink)
+        p[s + Scalar.LEFT] = square * shrink / ti.max((1.0 - ratio) * (1.0 - ratio), precise(1e-30))
+        if square < CONVERGED * one_error(slot, size, value, p) and factor > 0.999:
             p[s + Scalar.DONE] = precise(1.0)
         if lost > 0.5 or not (far < 1e6):
             p[s + Scalar.DONE], p[s + Scalar.CODE] = precise(1.0), singular
@@ -444,8 +458,8 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             step(slot, size, value, P, p)
             if passes >= size[Size.STEPS] and p[s + Scalar.DONE] < 0.5:
                 p[s + Scalar.DONE] = precise(1.0)
-                error = cost * value[Value.CORRELATION] * ti.cast(size[Size.UNKNOWNS], precise)
-                if p[s + Scalar.LAST] > ti.max(LAST_STEP * error, CONTRACTED * p[s + Scalar.FIRST]):
+                # Steps that are small no longer shrink: they follow the robust weights.
+                if ti.min(p[s + Scalar.LAST], p[s + Scalar.LEFT]) > LEFT * one_error(slot, size, value, p):
                     p[s + Scalar.CODE] = not_converged
         p[s + Scalar.ROBUST] = TUKEY * TUKEY * ti.max(cost, tolerated(slot, size, p))
         p[s + Scalar.RESAMPLE] = precise(0.0)
@@ -479,8 +493,9 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def finish(
-        slot: ti.template(), pixel: ti.i32, size: ti.template(), P: ti.template(), p: ti.template(), out: ti.template()
-    ):
+        slot: ti.template(), pixel: ti.i32, size: ti.template(), value: ti.template(), P: ti.template(),
+        p: ti.template(), out: ti.template(),
+    ):  # fmt: skip
         """Results and their covariance ``σ² H^-1 S H^-1``; NaN rows where the data do not determine an unknown."""
         s, n = scalars(slot, size), size[Size.UNKNOWNS]
         to = pixel * Out.N
@@ -509,7 +524,13 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             1.0 - ti.cast(size[Size.TERMS], precise) / p[s + Scalar.EFFECTIVE], precise(0.1)
         )
         variance = p[s + Scalar.COST] / left
-        variance *= doubt(slot, variance, size, P, p)
+        factor = doubt(slot, variance, size, P, p)
+        variance *= factor
+        if p[s + Scalar.CODE] == not_converged:
+            # What is left to go may be small against error bars that have grown.
+            left = ti.min(p[s + Scalar.LAST], p[s + Scalar.LEFT])
+            if left < LEFT * factor * one_error(slot, size, value, p):
+                out[to + Out.CODE] = precise(0.0)
         for i in range(n):
             for j in range(n):
                 element = precise(0.0)

@@ -141,8 +141,8 @@ class Scalar(IntEnum):
     COST = 1301  # of the last pass: mean squared residual
     BEST = 1302  # of the accepted one
     START = 1303  # of the start
-    FIRST = 1304  # square of the first step, in the metric of the normal equations
-    LAST = 1305
+    LAST = 1304  # square of the last step, in the metric of the normal equations
+    LEFT = 1305  # the same of what is left to go
     BACK = 1306  # factor of a step that had to be shortened
     PASSES = 1307
     DONE = 1308
