@@ -13,9 +13,11 @@ from leafflow_ti.filters import gaussian_radius
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.range_plan import RangePlan
 from leafflow_ti.refine_plan import Refinement
+from leafflow_ti.runtime import DENSE_LANES, usable_threads
 from leafflow_ti.stages.planes import round_up
 from leafflow_ti.stages.prefilter import prefilter_bytes
 from leafflow_ti.stages.problem import Problem
+from leafflow_ti.stages.refine_tables import Workspaces, bytes_per_pixel
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -61,6 +63,7 @@ class Demand:
             in_rows, in_cols = max(in_rows, wide.in_rows), max(in_cols, wide.in_cols)
             planes = len(self.refine.frames) * self.n_cameras
             total += planes * wide.in_rows * round_up(wide.in_cols, 64) * itemsize
+            total += self._refining(self.refine, itemsize, gpu) + band.rows * band.cols * bytes_per_pixel()
         margin = 0
         if config.filters.prefilter != "none":
             margin = gaussian_radius(config.filters.sigma_pre)
@@ -70,6 +73,12 @@ class Demand:
         unit = rows * self.cols * (4 * self.n_maps + 1)
         # One frame and one unit are worked on, and one unit is being written.
         return total + (1 + ahead) * block + (2 + WRITE_BEHIND) * unit
+
+    def _refining(self, refine: Refinement, itemsize: int, gpu: bool) -> int:
+        """Workspaces of the pixels that are refined at once."""
+        threads = self.config.plan.threads
+        count = usable_threads() if threads == "auto" else int(threads)
+        return Workspaces.of(refine, 1 if gpu else DENSE_LANES["f64"], (itemsize, 8), gpu, count).bytes
 
 
 def usable_memory(config: RunConfig) -> int:

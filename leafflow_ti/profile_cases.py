@@ -49,6 +49,11 @@ CASES: dict[str, Case] = {
         _SCENE,
         ("model.name=affine-scene-flow", "refine.steps=0", *_COMMON),
     ),
+    "refined": Case(
+        "the same with it: three steps at every sixteenth pixel, windows thinned by 3",
+        _SCENE,
+        ("model.name=affine-scene-flow", "refine.steps=3", "refine.thin=3", "window.stride=16", *_COMMON),
+    ),
     "depth": Case(
         "depth and normals from one frame of it", replace(_SCENE, n_frames=1), ("model.name=depth", *_COMMON)
     ),

@@ -8,8 +8,8 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,14 @@ from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.pipeline import Maps, Pipeline
 from leafflow_ti.plan import Plan, Unit, make_plan
+from leafflow_ti.refine_plan import Effort
+from leafflow_ti.refine_work import count_refinement
 from leafflow_ti.results import ResultStore
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.trace import BACKGROUND_STAGES, STAGES, Event, Trace, active, span
-from leafflow_ti.work import Rate, count_work, rate
+from leafflow_ti.work import Rate, Work, count_work, rate
 
 ALONE_FRAMES = 3
 """Frames read, and times a unit is written, to see what that costs by itself."""
@@ -38,6 +40,9 @@ WAITING_SHARE = 0.2
 """Share of the time that computing waits above which reading or writing is what limits."""
 LAUNCH_SHARE = 0.5
 """Share of a stage's time that it takes for a single pixel, too, above which launches are what limits."""
+
+_BESIDE = {"read": "disk", "write": "disk", "decode": "decoding", "prefilter": "compute"}
+"""What limits a stage whose work is not counted."""
 
 Result = tuple[Unit, Maps, NDArray[np.uint8]]
 
@@ -47,9 +52,10 @@ class StageCost:
     """One stage for one unit in the middle of a sequence.
 
     ``seconds``; ``us_per_pixel`` of the unit; ``share`` of the time on the clock (stages beside the computing may hide
-    behind it). ``gflops`` [10^9/s], ``gbytes`` [10^9 bytes/s] of the work that the stage must do, and their shares of
-    what the machine can do, where that is counted. ``limit``: "launches" where a single pixel takes half as long, else
-    the ceiling that is nearer, "compute" or "memory"; "disk" or "decoding" beside the computing.
+    behind it). Where the stage's work is counted: ``flops_per_pixel``, what it reached, ``gflops`` [10^9/s] and
+    ``gbytes`` [10^9 bytes/s], and their shares of what the machine can do. ``limit``: "launches" where a single pixel
+    takes half as long, else the ceiling that is nearer, "compute" or "memory"; "disk" or "decoding" beside the
+    computing.
     """
 
     stage: str
@@ -57,6 +63,7 @@ class StageCost:
     us_per_pixel: float
     share: float
     limit: str
+    flops_per_pixel: float | None = None
     gflops: float | None = None
     gbytes: float | None = None
     share_of_flops: float | None = None
@@ -82,7 +89,8 @@ class Profile:
     """What was measured. ``unit``: rows and columns of output pixels; ``seconds_per_unit`` on the clock, in the middle
     of a sequence; ``fill_seconds``: for the frames that fill the windows before the first unit; ``overlap``: share of
     reading, decoding and writing that computing does not wait for, None where they cost nothing; ``planned_bytes`` of
-    the arrays, ``peak_bytes`` of the process, measurement included (None where the system does not tell).
+    the arrays, ``peak_bytes`` of the process, measurement included (None where the system does not tell); ``effort`` of
+    the refinement per output pixel, None without one.
     """
 
     model: str
@@ -100,6 +108,7 @@ class Profile:
     peak_bytes: int | None
     ceilings: Ceilings
     prediction: Prediction
+    effort: Effort | None
 
     def to_json(self) -> dict[str, Any]:
         """As JSON values; what is not known is null."""
@@ -167,7 +176,8 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
     pixels = (plan.band(band).stop - plan.band(band).start) * len(plan.x)
     ceilings = measure_ceilings(device)
     computed = (rows.stop - rows.start) * (cols.stop - cols.start)
-    work = {stage: one * computed for stage, one in count_work(plan).items()}
+    effort = pipeline.effort.per(measured * computed) if plan.refine else None
+    work = {**count_work(plan), **count_refinement(plan, effort)}
     spent = {**steps.stages, **background}
     if "estimate" in spent:
         pipeline.release()  # the memory that is planned is enough for one
@@ -175,16 +185,18 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
         for times in (spent, least):
             whole = times.pop("estimate")
             times |= {"solve": solving * whole, "fit": (1.0 - solving) * whole}
-    reached = {
-        s: rate(s, one, spent[s], ceilings, device.storage, device.algebra)
-        for s, one in work.items()
-        if spent.get(s, 0.0) > 0.0
-    }
-    stages = tuple(_cost(s, spent[s], seconds, pixels, reached.get(s), least.get(s, 0.0)) for s in STAGES if s in spent)
+    stages = []
+    for s in (s for s in STAGES if s in spent):
+        cost = StageCost(s, spent[s], spent[s] / pixels * 1e6, spent[s] / seconds, _BESIDE.get(s, ""))
+        if s in work and spent[s] > 0.0:
+            reached = rate(s, work[s] * computed, spent[s], ceilings, device.storage, device.algebra)
+            cost = _rated(cost, work[s], reached, least.get(s, 0.0))
+        stages.append(cost)
     return Profile(
         plan.model, str(device), (pixels // len(plan.x), len(plan.x)), measured, compiling, seconds, pixels / seconds,
-        steps.fill, stages, _limit(stages, steps.waits, seconds), _overlap(background, steps.waits), plan.bytes,
+        steps.fill, tuple(stages), _limit(stages, steps.waits, seconds), _overlap(background, steps.waits), plan.bytes,
         _peak_bytes(), ceilings, predict(pipeline, band, steps.fill, seconds, steps.stages, compiling),
+        effort,
     )  # fmt: skip
 
 
@@ -194,7 +206,7 @@ def _share_of_solving(plan: Plan, capture: Capture, device: Device, band: int) -
     The second time counts: at the first, memory is fetched from the system.
     """
     trace = Trace(barrier=device.synchronize)
-    pipeline = Pipeline(plan, capture, device, trace, apart=True)
+    pipeline = Pipeline(replace(plan, refine=None), capture, device, trace, apart=True)
     others = set(range(plan.n_units)) - {plan.unit(0, band).index}
     pipeline.run(others, lambda *_: None)
     before = trace.seconds
@@ -212,7 +224,7 @@ def predict(
     rows of images, the rest with the rows of output that are computed; a band that is all border costs nothing.
     """
     plan, latency = pipeline.plan, pipeline.plan.problem.sampling.t.radius
-    filters = sum(stages.get(s, 0.0) for s in ("prefilter", "filter"))
+    filters = sum(stages.get(s, 0.0) for s in ("prefilter", "filter", "splines"))
     n = len(plan.frames)
     seconds, read = compiling, 0
     high = _height(pipeline.extent(band))
@@ -266,16 +278,15 @@ def _write(store: ResultStore, result: Result) -> None:
     store.write_unit(unit.index, unit.t_index, unit.rows, maps, status)
 
 
-def _cost(stage: str, seconds: float, clock: float, pixels: int, reached: Rate | None, least: float) -> StageCost:
-    limit = {"read": "disk", "write": "disk", "decode": "decoding", "prefilter": "compute"}.get(stage, "")
-    us, share = seconds / pixels * 1e6, seconds / clock
-    if reached is None:
-        return StageCost(stage, seconds, us, share, limit)
-    limit = "launches" if least > LAUNCH_SHARE * seconds else reached.limit
-    return StageCost(stage, seconds, us, share, limit, reached.gflops, reached.gbytes, reached.compute, reached.memory)
+def _rated(cost: StageCost, work: Work, reached: Rate, least: float) -> StageCost:
+    """With what the stage reached. ``work`` per pixel; ``least``: seconds that it takes for a single one."""
+    return replace(
+        cost, limit="launches" if least > LAUNCH_SHARE * cost.seconds else reached.limit, flops_per_pixel=work.flops,
+        gflops=reached.gflops, gbytes=reached.gbytes, share_of_flops=reached.compute, share_of_bytes=reached.memory,
+    )  # fmt: skip
 
 
-def _limit(stages: tuple[StageCost, ...], waits: Mapping[str, float], clock: float) -> str:
+def _limit(stages: Sequence[StageCost], waits: Mapping[str, float], clock: float) -> str:
     """What limits the whole: reading or writing where computing waits for it, else what limits the longest stage."""
     by_name = {cost.stage: cost for cost in stages}
     if sum(waits.values()) > WAITING_SHARE * clock:

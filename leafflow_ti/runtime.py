@@ -185,7 +185,8 @@ def _initialise(arch: str, threads: int) -> bool:
     return True
 
 
-def _usable_threads() -> int:
+def usable_threads() -> int:
+    """Threads of the CPU that this process may use."""
     with contextlib.suppress(AttributeError):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -204,7 +205,7 @@ def start(arch: str = "auto", precision: str = "f32", threads: int | None = None
         arch = os.environ.get("LEAFFLOW_TI_ARCH", "auto")
     if arch != "auto" and arch not in ARCHES:
         raise DeviceError(f"arch '{arch}' does not exist; choose auto, {', '.join(ARCHES)}")
-    n_threads = threads or _usable_threads()
+    n_threads = threads or usable_threads()
     with _lock:
         running = _running()
         if running is None:

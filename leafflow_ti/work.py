@@ -6,7 +6,8 @@ written once. Halos, padding, masks, prefilters and conversions of grey values a
 lower the share of the machine's ceilings that a stage reaches. Times are of one more frame of a sequence.
 
 Stages: ``filter`` (derivatives, products and their sums over cameras, per new frame), ``tensor`` (sums over frames,
-moment windows), ``solve`` (null space, covariances of the flow parameters), ``fit`` (geometry, motion, maps).
+moment windows), ``solve`` (null space, covariances of the flow parameters), ``fit`` (geometry, motion, maps). Those of
+the exact refinement are counted by ``refine_work``.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class Rate:
 
 
 def rate(stage: str, work: Work, seconds: float, ceilings: Ceilings, storage: str, algebra: str) -> Rate:
-    """What one of ``STAGES`` reached that did ``work`` in ``seconds``; small matrices are in the ``algebra`` precision.
+    """What a stage reached that did ``work`` in ``seconds``; small matrices are in the ``algebra`` precision.
 
     ``storage``, ``algebra``: "f32" or "f64", as of a ``Device``.
     """
@@ -237,12 +238,13 @@ def _window_flops(data: _Data, stride: int, block: int) -> float:
     return flops + 2.0 * (wide + EXTRA) * size_x
 
 
-def _cholesky(n: int) -> float:
+def cholesky_flops(n: int) -> float:
+    """The factor of a symmetric matrix."""
     return n * (n * n - 1) / 3 + n * (n - 1) / 2 + 2 * n
 
 
-def _substitute(n: int, columns: int) -> float:
-    """Both triangular solves."""
+def substitution_flops(n: int, columns: int) -> float:
+    """Both triangular solves, for so many right sides."""
     return 2.0 * n * n * columns
 
 
@@ -254,19 +256,20 @@ def _jacobi(n: int, sweeps: int) -> float:
 def _solve_flops(problem: Problem, columns: ColumnSet) -> float:
     """Null space, parameters, residuals and covariances of one data vector."""
     n, flow, k = columns.n, columns.n_flow, columns.n_time_like
-    flops = n * (n + 1) + _cholesky(n) + flow * flow * k  # scaling, factor, least-squares start
+    flops = n * (n + 1) + cholesky_flops(n) + flow * flow * k  # scaling, factor, least-squares start
     if problem.estimator != "ols" and problem.solver == "fast":
         m = GUARDED[k]
         orthogonalise = m * (m - 1) / 2 * 4 * n + m * 3 * n
-        flops += problem.iterations * (_substitute(n, m) + orthogonalise)
+        flops += problem.iterations * (substitution_flops(n, m) + orthogonalise)
         flops += n * n * m + m * (m + 1) * n + _jacobi(m, RITZ_SWEEPS) + 4 * n * m * m
         flops += k * (n * n + 4 * n)  # residual against the gap
     elif problem.estimator != "ols":
         flops += _jacobi(n, FULL_SWEEPS)
     flops += 2 * flow * k * k + k * (n * n + 3 * n)
-    flops += flow * (flow + 1) + _cholesky(flow)  # J_ff without its noise
+    flops += flow * (flow + 1) + cholesky_flops(flow)  # J_ff without its noise
     for rows in _rows(problem, columns):
-        flops += flow * (flow + 1) / 2 + _substitute(flow, rows) + 2 * flow * flow * rows + rows * (rows + 1) * flow
+        flops += flow * (flow + 1) / 2 + substitution_flops(flow, rows)
+        flops += 2 * flow * flow * rows + rows * (rows + 1) * flow
     return flops
 
 
@@ -290,11 +293,11 @@ def _fit_flops(problem: Problem, differences: bool) -> float:
     motion_rows = 2 * len(problem.offsets)
     for axis in problem.camera_axes:
         rows = 2 * terms
-        flops += _cholesky(rows) + _substitute(rows, terms) + rows * terms * 2
+        flops += cholesky_flops(rows) + substitution_flops(rows, terms) + rows * terms * 2
         if "t" in columns.solutions:
             flops += rows * motion_rows * (2 * len(cross_noise(sampling, columns, axis, "t")) + 2 * terms)
     if terms:
-        flops += _cholesky(terms) + _substitute(terms, 1 + motion_rows + terms)
+        flops += cholesky_flops(terms) + substitution_flops(terms, 1 + motion_rows + terms)
     variants = 3 if differences else 1
     for i in range(problem.passes if problem.fitted else 0):
         last = i == problem.passes - 1 and not own
@@ -314,10 +317,10 @@ def _row_set_flops(rows: int, terms: int, unknowns: int, variants: int, finish: 
     """
     flops = rows * (ROW_FLOPS + 2 * unknowns) * (1.0 + min(terms, 3))  # forward differences
     flops += rows * terms * 2 * (terms + (rows + 1) / 2)  # D C_g D^T
-    flops += _cholesky(rows) + _substitute(rows, unknowns)
+    flops += cholesky_flops(rows) + substitution_flops(rows, unknowns)
     flops += rows * unknowns * (unknowns + 1) + 2 * rows * unknowns
     flops += variants * 2 * rows * unknowns * (rows + (unknowns + 1) / 2 + 2 * terms)
     if finish:
-        flops += _cholesky(unknowns) + _substitute(unknowns, 1)
-        flops += variants * (2 * _substitute(unknowns, unknowns) + 2 * unknowns * terms * (terms + unknowns + 1))
+        flops += cholesky_flops(unknowns) + substitution_flops(unknowns, 1)
+        flops += variants * (2 * substitution_flops(unknowns, unknowns) + 2 * unknowns * terms * (terms + unknowns + 1))
     return flops

@@ -1,17 +1,22 @@
-"""Microseconds per output pixel of each stage of the 4D affine model, and what of the machine's ceilings they reach.
+"""Microseconds per output pixel of each stage of the 4D affine model, and of the refinement of the default model, and
+what of the machine's ceilings they reach.
 
 Ceilings are measured in the same run, with vector instructions of all threads: multiply-adds on registers, and
-``a = b + f c`` in memory. What a stage must compute and move is counted from the plan (``leafflow_ti.work``); what an
-implementation does beyond it, halos and conversions, lowers its share.
+``a = b + f c`` in memory. What a stage must compute and move is counted from the plan (``work`` and ``refine_work`` of
+the library); what an implementation does beyond it, halos and conversions, lowers its share.
 """
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import asdict, dataclass, field
 
 from leafflow_ti.capture import Capture
 from leafflow_ti.ceilings import Ceilings, measure_ceilings
+from leafflow_ti.pipeline import Pipeline
+from leafflow_ti.refine_work import count_refinement
 from leafflow_ti.runtime import Device, start
+from leafflow_ti.trace import Trace
 from leafflow_ti.work import Rate, Work, count_work, rate
 from perf.bench import Scene, Timed, time_stages
 from perf.cases import Options
@@ -24,11 +29,16 @@ GOALS = {"A": 0.15, "B": 0.30, "C": 0.10}
 
 @dataclass(frozen=True)
 class Settings:
-    """``strides``, and the ``brightness`` models: without and with intensity columns (12 and 17 of them)."""
+    """``strides``, and the ``brightness`` models: without and with intensity columns (12 and 17 of them).
+
+    ``steps``: of the refinement, at every ``refined``-th pixel.
+    """
 
     scene: Scene = field(default_factory=Scene)
     strides: tuple[int, ...] = (1, 4)
     brightness: tuple[str, ...] = ("none", "camera")
+    steps: int = 3
+    refined: int = 16
     repeats: int = 9
 
 
@@ -98,6 +108,39 @@ def _of_scene(settings: Settings, capture: Capture, machine: Machine) -> tuple[l
     return figures, planned
 
 
+def _of_refinement(settings: Settings, capture: Capture, machine: Machine) -> list[Figure]:
+    """Splines of one frame, and the refinement of the pixels of one."""
+    plan = settings.scene.plan(
+        capture, model="affine-scene-flow", refine=settings.steps, thin=None, stride=settings.refined
+    )
+    trace = Trace(barrier=machine.device.synchronize)
+    pipeline = Pipeline(plan, capture, machine.device, trace)
+    warm_up = pipeline.warm_up()
+    seconds: dict[str, list[float]] = {"splines": [], "refine": []}
+    for _ in range(settings.repeats):
+        before = trace.seconds
+        pipeline.run(set(), lambda *_: None)
+        for stage, found in seconds.items():
+            found.append(trace.seconds[stage] - before.get(stage, 0.0))
+    pixels = len(plan.y) * len(plan.x)
+    effort = pipeline.effort.per(pixels * settings.repeats)
+    frames = {"splines": capture.n_frames, "refine": 1}
+    figures = []
+    for stage, per_pixel in count_refinement(plan, effort).items():
+        one = statistics.median(seconds[stage]) / frames[stage]
+        found = machine.rate(stage, per_pixel * pixels, one)
+        note = f"{per_pixel.flops:.3g} flops per pixel: {_words(found)}"
+        figures += [
+            Figure(f"{stage}, stride {settings.refined}", 1e6 * one / pixels, "us/px", note=note),
+            Figure(f"{stage}, share of the multiply-add peak", found.compute),
+        ]
+    return [
+        *figures,
+        Figure("refinement: steps of a pixel", effort.passes, note=f"{effort.samplings:.2f} of them interpolate"),
+        Figure("compiling or loading, refined", warm_up, "s"),
+    ]
+
+
 def measure(settings: Settings) -> Outcome:
     """Ceilings, then the stages."""
     capture = settings.scene.capture()
@@ -105,6 +148,7 @@ def measure(settings: Settings) -> Outcome:
     machine = Machine(device, measure_ceilings(device))
     before = peak_mib()
     figures, planned = _of_scene(settings, capture, machine)
+    figures += _of_refinement(settings, capture, machine)
     memory = (
         Figure("memory planned for the largest output", planned / 2**20, "MiB"),
         Figure("peak memory of the process", peak_mib(), "MiB", note=f"{before:.0f} MiB before: images, interpreter"),

@@ -150,6 +150,9 @@ def test_stages_are_put_beside_the_ceilings() -> None:
     found = by_name(stages.measure(stages.Settings(SMALL, strides=(2,), brightness=("none",), repeats=1)))
     for letter in "ABC":
         assert found[f"{letter}, share of the multiply-add peak, 12 columns, stride 2"].value > 0
+    for stage in ("splines", "refine"):
+        assert 0 < found[f"{stage}, share of the multiply-add peak"].value < 1
+    assert 1 <= found["refinement: steps of a pixel"].value <= 2 * 3
 
 
 def test_a_fresh_process_tells_units_and_memory(tmp_path: Path) -> None:

@@ -320,11 +320,16 @@ def test_the_engine_is_left_as_it_was() -> None:
 
     start()
     config = ti.lang.impl.current_cfg()
-    split = config.real_matrix_scalarize
-    whole = LaneKernel.__new__(LaneKernel)
-    whole._kernel = lambda: config.real_matrix_scalarize
-    assert whole() is False
-    assert config.real_matrix_scalarize == split
+
+    def set_now() -> tuple[bool, bool]:
+        return config.real_matrix_scalarize, config.advanced_optimization
+
+    engine_wide = set_now()
+    for long in (False, True):
+        whole = LaneKernel(set_now, long)
+        whole._kernel = set_now
+        assert whole() == (False, engine_wide[1] and not long)
+        assert set_now() == engine_wide
 
 
 @pytest.mark.parametrize("model", ["affine-4d", "affine-scene-flow"])

@@ -20,6 +20,7 @@ from leafflow_ti.errors import ConfigError, UsageError
 from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.profile_cases import CASES, find_case
 from leafflow_ti.profiling import Profile, predict, profile
+from leafflow_ti.refine_work import count_refinement
 from leafflow_ti.runtime import start
 from leafflow_ti.synthetic.write import write_scene
 from leafflow_ti.trace import STAGES, Trace
@@ -120,6 +121,32 @@ def test_profile_in_words(measured: tuple[Profile, Path]) -> None:
         assert any(line.startswith(f"{stage} ") for line in text.splitlines()), stage
 
 
+def test_profile_of_a_refinement(capture: Capture) -> None:
+    """Its stages stand beside the others with what they reached, and its effort lies within the plan's."""
+    wanted = config(model="affine-scene-flow", refine=3, thin=1, window=21, stride=8, frames="5:6", motion="auto")
+    found = profile(capture, wanted, 1)
+    stages = {cost.stage: cost for cost in found.stages}
+    plan = lf.plan_run(capture, wanted)
+    assert found.effort is not None
+    assert 1 <= found.effort.refined <= 2
+    assert found.effort.refined <= found.effort.samplings <= found.effort.passes <= 3 * found.effort.refined
+    assert stages["refine"].flops_per_pixel == count_refinement(plan, found.effort)["refine"].flops
+    for stage in ("splines", "refine"):
+        assert stages[stage].limit in ("compute", "memory", "launches")
+        assert 0 < (stages[stage].share_of_flops or 0) < 1
+    text = "\n".join(format_profile(found))
+    assert f"in {found.effort.passes:.2f} steps" in text
+    assert all(f"\n{stage} " in text for stage in ("splines", "refine"))
+
+
+def test_prediction_filters_a_bands_rows_for_the_refinement(capture: Capture) -> None:
+    """Spline coefficients grow with the rows of images, as filters do."""
+    plan = lf.plan_run(capture, config(tile=16, frames="6:7"))
+    pipeline = Pipeline(plan, capture, start())
+    filtered, splines = (predict(pipeline, 1, 3.0, 5.0, {stage: 1.0}, 0.0) for stage in ("filter", "splines"))
+    assert filtered == splines
+
+
 def test_nothing_to_measure_is_refused(capture: Capture) -> None:
     with pytest.raises(ConfigError, match="no pixel can be measured"):
         profile(capture, config(window=61))
@@ -130,13 +157,17 @@ def test_cases_are_what_their_settings_describe(name: str) -> None:
     case = CASES[name]
     made = case.capture(1)
     plan = lf.plan_run(made, lf.load_config(sets=case.settings))
-    assert plan.model == name.removesuffix("-stride4")
+    assert plan.model == ("affine-scene-flow" if name == "refined" else name.removesuffix("-stride4"))
+    assert (plan.refine is not None) == (name == "refined")
     stride = plan.config.window.stride
-    assert (len(plan.y), len(plan.x)) == (300 // stride, 300 // stride)
+    assert (len(plan.y), len(plan.x)) == (-(-300 // stride), -(-300 // stride))
     assert len(plan.frames) == 1
     pipeline = Pipeline(plan, made, start())
     covered = sum(rows.stop - rows.start for rows, _ in map(pipeline.extent, range(plan.bands)))
-    assert covered == len(plan.y) + 2 * plan.margin * plan.bands  # all of it is measured
+    # All of it is measured, and the rows around each band where the windows of those lie inside the images.
+    reach, last = plan.reach("y"), made.height - 1
+    around = (plan.y[0] - stride >= reach) + (plan.y[-1] + stride <= last - reach)
+    assert covered == len(plan.y) + plan.margin * (around + 2 * (plan.bands - 1))
     assert np.ptp(made.read(0, 0, 0, 0, 9, 0, 9)) > 0
 
 

@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter, spline_filter1d
 
 from leafflow_ti.splines import LEAST_TAP, PREFILTER_SIGMA, filter_radius, filter_taps, spline, spline_pieces, support
-from leafflow_ti.stages.refine_tables import _noise_correlation
+from leafflow_ti.stages.refine_tables import noise_correlation
 
 DEGREES = (5, 7)
 
@@ -89,7 +89,7 @@ def test_noise_is_correlated_as_stated(thin: int, degree: int) -> None:
     noise = np.random.default_rng(thin).normal(size=260_000)
     at = np.arange(40, noise.size - 80) + np.random.default_rng(0).uniform(size=noise.size - 120)
     values = interpolated(noise, at, degree)
-    stated = _noise_correlation(thin, degree)
+    stated = noise_correlation(thin, degree)
     assert stated[0] == 1
     for step in range(len(stated) + 1):
         apart = interpolated(noise, at + step * thin, degree)

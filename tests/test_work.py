@@ -14,7 +14,10 @@ from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.ceilings import Ceilings, measure_ceilings
 from leafflow_ti.config import load_config
 from leafflow_ti.plan import Plan, make_plan
+from leafflow_ti.refine_plan import Effort
+from leafflow_ti.refine_work import count_refinement, refine_flops
 from leafflow_ti.runtime import Device
+from leafflow_ti.splines import filter_taps
 from leafflow_ti.work import STAGES, Work, count_work, rate
 
 
@@ -81,6 +84,53 @@ def test_every_model_has_work_in_every_stage(model: str, estimator: str) -> None
 def test_full_jacobi_is_counted_as_the_dearer_solver() -> None:
     fast, full = (count_work(plan(model="affine-4d", solver=solver)) for solver in ("fast", "jacobi"))
     assert full["solve"].flops > 3 * fast["solve"].flops
+
+
+def refined(**options: Any) -> Plan:
+    """Windows of 21 x 21 samples in nine images of each of nine frames."""
+    return plan(model="affine-scene-flow", **{"refine": 3, "window": 41, "thin": 2, **options})
+
+
+def test_nothing_is_counted_without_a_refinement() -> None:
+    assert count_refinement(plan(model="affine-4d")) == {}
+
+
+def test_interpolation_is_counted_as_by_hand() -> None:
+    """Quintic splines: 36 neighbours, six of them in each of six rows."""
+    one, two = (count_refinement(refined(), Effort(1, 2, n))["refine"].flops for n in (1, 2))
+    # Polynomials of degree 5, 4, 3 and their six neighbours, along x and y; sums of a row, and of the rows.
+    weights, rows = 2 * 6 * 2 * (5 + 4 + 3), 6 * (3 * 6 * 2 + 6 * 2)
+    # Position, 15, and what is left of it behind the pixel, 2; the texture's two slopes and three curvatures.
+    image = 15 + 2 + weights + rows + 2 * 5 + 3 * 7
+    # In a pass that does not interpolate two positions, and the expansion between them.
+    expanded = 2 * 15 + 2 + 12
+    window = 14  # means, and products with the window's coordinates
+    assert two - one == 21**2 * (81 * (image - expanded) + window)
+
+
+def test_splines_are_filtered_along_two_axes() -> None:
+    found = count_refinement(refined(stride=4))["splines"]
+    assert found.flops == 9 * 4**2 * 2 * 2 * len(filter_taps())
+    assert found.bytes == 9 * 4**2 * 2 * 4
+
+
+def test_refinement_is_linear_in_effort_and_nearly_in_samples() -> None:
+    flops = [count_refinement(refined(), Effort(*e))["refine"].flops for e in ((1, 1, 1), (0, 1, 1), (1, 0, 0))]
+    assert flops[0] == pytest.approx(flops[1] + flops[2])
+    assert count_refinement(refined())["refine"] == count_refinement(refined(), Effort(1, 3, 3))["refine"]
+    dense = count_refinement(refined(thin=1))["refine"].flops
+    assert 0.9 * (41 / 21) ** 2 < dense / count_refinement(refined())["refine"].flops < (41 / 21) ** 2
+
+
+@pytest.mark.parametrize("brightness", ["none", "temporal", "spatial", "camera"])
+def test_more_photometric_terms_are_more_work(brightness: str) -> None:
+    terms = refined(brightness=brightness).refine
+    plain, found = (
+        refine_flops(p, Effort(1, 3, 1)) for p in (replace(terms, terms=0, modes=0), replace(terms, modes=0))
+    )
+    assert (found > plain) == (brightness != "none")
+    assert found < 1.5 * plain
+    assert refine_flops(replace(terms, modes=3), Effort(1, 3, 1)) > found
 
 
 def test_ceilings_are_rates(device: Callable[[str], Device]) -> None:

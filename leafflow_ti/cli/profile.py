@@ -29,7 +29,8 @@ def profile(
         typer.Option(
             "--case",
             metavar="NAME",
-            help="A built-in synthetic capture instead: affine-4d, affine-4d-stride4, affine-scene-flow, depth.",
+            help="A built-in synthetic capture instead: affine-4d, affine-4d-stride4, affine-scene-flow, "
+            "refined, depth.",
             show_default=False,
         ),
     ] = None,
@@ -79,20 +80,32 @@ def format_profile(found: Profile) -> list[str]:
         f"measured    {found.frames_measured} units of {found.unit[0]} x {found.unit[1]} pixels, "
         f"after {found.fill_seconds:.2f} s to fill the windows",
         "",
-        f"{'stage':<10} {'ms/unit':>9} {'us/px':>8} {'of time':>8} {'GFLOP/s':>8} {'of peak':>8} {'GB/s':>7} "
-        f"{'of peak':>8}  limit",
+        f"{'stage':<10} {'ms/unit':>9} {'us/px':>8} {'of time':>8} {'flops/px':>9} {'GFLOP/s':>8} {'of peak':>8} "
+        f"{'GB/s':>7} {'of peak':>8}  limit",
         *(_row(cost) for cost in found.stages),
         f"{'unit':<10} {1e3 * found.seconds_per_unit:9.1f} "
-        f"{1e6 / found.pixels_per_second:8.3f} {1:8.0%}{'':36}  {found.limit}",
+        f"{1e6 / found.pixels_per_second:8.3f} {1:8.0%}{'':46}  {found.limit}",
         "",
         *(f"{c.stage:<10} {STAGES[c.stage]}" for c in found.stages),
         "",
+        *_effort(found),
         f"Read, decode and write go on beside the computing: what they cost alone{overlap}.",
         f"speed       {format_rate(found.pixels_per_second)}, limited by {found.limit}",
         f"memory      {found.planned_bytes / 2**20:.0f} MiB planned{peak}",
         f"whole       {whole.units} units ({whole.frames} frames x {whole.bands} bands, {whole.frames_read} frames "
         f"read): about {format_duration(whole.seconds)}",
         "            = compiling + for every band: filling the windows + frames x unit, by rows",
+    ]
+
+
+def _effort(found: Profile) -> list[str]:
+    """Of the refinement, in a line."""
+    if not found.effort:
+        return []
+    e = found.effort
+    return [
+        f"An output pixel was refined {e.refined:.2f} times (twice where the first failed) in {e.passes:.2f} steps, "
+        f"in {e.samplings:.2f} of which the images were interpolated anew."
     ]
 
 
@@ -103,6 +116,7 @@ def _row(cost: StageCost) -> str:
     name = f"({cost.stage})" if cost.stage in BACKGROUND_STAGES else cost.stage
     return (
         f"{name:<10} {1e3 * cost.seconds:9.1f} {cost.us_per_pixel:8.3f} {cost.share:8.0%} "
-        f"{number(cost.gflops, '.1f', 8)} {number(cost.share_of_flops, '.1%', 8)} {number(cost.gbytes, '.2f', 7)} "
+        f"{number(cost.flops_per_pixel, '.3g', 9)} {number(cost.gflops, '.1f', 8)} "
+        f"{number(cost.share_of_flops, '.1%', 8)} {number(cost.gbytes, '.2f', 7)} "
         f"{number(cost.share_of_bytes, '.1%', 8)}  {cost.limit}"
     )

@@ -42,7 +42,7 @@ class RefineTables:
         from leafflow_ti.kernels.refine_tables import Image, Size, Value
 
         size, _, _ = _sizes(plan, lanes, gpu)
-        correlation = _noise_correlation(plan.thin, plan.degree)
+        correlation = noise_correlation(plan.thin, plan.degree)
         size[Size.PITCH], size[Size.NEIGHBOURS] = pitch, len(correlation) - 1
         k, n_samples = size[Size.IMAGES], size[Size.SAMPLES]
         images, groups = size[Size.IMAGE_GROUPS], size[Size.SAMPLE_GROUPS]
@@ -155,7 +155,7 @@ def _lay_out(size: NDArray[np.int32], lengths: dict[Any, int]) -> int:
     return at
 
 
-def _noise_correlation(thin: int, degree: int) -> Array:
+def noise_correlation(thin: int, degree: int) -> Array:
     """Correlation of the noise of warped images at 0, ``thin``, 2 ``thin``, ... px, until it is below 1e-3.
 
     White noise that is filtered and interpolated at positions that fall anywhere between the pixels has, on average,
