@@ -51,7 +51,7 @@ def count_refinement(plan: Plan, effort: Effort | None = None) -> dict[str, Work
     pixels = plan.x.step**2
     results = 8 * (Out.N + MAX_UNKNOWNS + 2)  # beside them the start
     return {
-        "splines": Work(2 * 2 * len(filter_taps()), 2 * itemsize) * (len(refine.cameras) * pixels),
+        "splines": Work(2 * 2 * len(filter_taps(refine.degree)), 2 * itemsize) * (len(refine.cameras) * pixels),
         "refine": Work(
             refine_flops(refine, effort), itemsize * _images(refine) * pixels + results * effort.refined
         ),
@@ -74,7 +74,7 @@ def _images(plan: Refinement) -> int:
 
 def _sampling_flops(plan: Refinement) -> float:
     """All images at all samples with two derivatives, and the texture's derivatives from theirs."""
-    pieces = spline_pieces()
+    pieces = spline_pieces(plan.degree)
     n_derivatives, across, _ = pieces.shape
     degrees = sum(int(np.flatnonzero(piece).max()) for piece in pieces.reshape(n_derivatives * across, -1))
     weights = 2 * 2 * degrees  # Horner's rule, along both axes

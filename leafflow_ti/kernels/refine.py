@@ -8,6 +8,7 @@ import functools
 from enum import IntEnum, auto
 
 from leafflow_ti.kernels.engine import lane_kernel, lane_type, ti
+from leafflow_ti.kernels.refine_noise import noise_functions
 from leafflow_ti.kernels.refine_samples import sample_functions
 from leafflow_ti.kernels.refine_solve import solve_functions
 from leafflow_ti.kernels.refine_tables import FUNCTIONS, SHIFTS, Scalar, Size
@@ -44,6 +45,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
     """
     real, precise, lanes = spec.real, spec.precise, spec.lanes
     warps, samples, solver = warp_functions(spec), sample_functions(spec, taps), solve_functions(spec)
+    noises = noise_functions(spec)
     scalars = warps.scalars
     reals, precises = lane_type(real, lanes), spec.element
 
@@ -78,9 +80,9 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
         for i in range(size[Size.IMAGES]):
             samples.halves(slot, i, size, value, sample, S, r, p)
         for i in range(SHIFTS):
-            samples.spread_noise(slot, i, size, value, r, p)
+            noises.spread_noise(slot, i, size, value, r, p)
         for i in range(SHIFTS):
-            samples.noise(slot, i, size, r, p)
+            noises.noise(slot, i, size, r, p)
         solver.finish(slot, pixel, size, value, P, p, out)
 
     @ti.func
@@ -97,9 +99,9 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
         elif ti.static(stage == Stage.HALVES):
             samples.halves(slot, i, size, value, sample, S, r, p)
         elif ti.static(stage == Stage.SPREAD):
-            samples.spread_noise(slot, i, size, value, r, p)
+            noises.spread_noise(slot, i, size, value, r, p)
         elif ti.static(stage == Stage.NOISE):
-            samples.noise(slot, i, size, r, p)
+            noises.noise(slot, i, size, r, p)
         elif ti.static(stage == Stage.FINISH):
             solver.finish(slot, pixel, size, value, P, p, out)
         elif p[scalars(slot, size) + Scalar.DONE] < 0.5:

@@ -74,6 +74,7 @@ class RefineStage:
         self._next = 0
         self._filters = _filters(device, rows, self.pitch, plan.degree)
         self._mask: Any = None
+        self._gaps: list[Gaps | None] = [None] * n
         lanes = device.dense.lanes
         tables = RefineTables.of(plan, view, lanes, self.pitch, device.gpu)
         self.size = tables.size
@@ -107,31 +108,27 @@ class RefineStage:
         images, valid = (a.reshape(n, self.rows, self.cols) for a in (block, finite))
         with span("splines"):
             for k in range(n):
-                to = (slot * n + k) * self._plane
-                spoilt = None
-                image = images[k]
-                if not valid[k].all():
-                    image = _filled(image, valid[k])
-                    spoilt = _dilated(~valid[k], SPOILT)
-                self._filter(image, spoilt, to, NOTHING)
+                gaps = self._gaps[k]
+                if gaps is None or not np.array_equal(gaps.valid, valid[k]):
+                    self._gaps[k] = gaps = Gaps.of(valid[k], self.pitch, filter_radius(self.plan.degree))
+                self._filter(images[k], gaps, (slot * n + k) * self._plane, NOTHING)
 
-    def _filter(self, image: Array, spoilt: NDArray[np.bool_] | None, to: int, nothing: float) -> None:
-        """Spline coefficients of one image; the outermost rows and columns, which lack neighbours, are none."""
+    def _filter(self, image: Array, gaps: Gaps, to: int, nothing: float) -> None:
+        """Spline coefficients of one image; those without a meaning are ``nothing``."""
         along_y, along_x, padded, tall = self._filters
         r = filter_radius(self.plan.degree)
         wide = np.zeros((self.rows + 2 * r, self.pitch), image.dtype)
         wide[r:-r, : self.cols] = image
+        wide.ravel()[gaps.filled] = image.ravel()[gaps.source]
         self.device.write(padded, 0, wide)
         along_y(padded, tall, r)
         along_x(tall, self._coefficients, to)
-        edge = np.ones((self.rows, self.pitch), bool)
-        edge[r:-r, r : self.cols - r] = False if spoilt is None else spoilt[r:-r, r : self.cols - r]
         if self.device.gpu:
             plane = self.device.host(self._coefficients)[to : to + self._plane].copy()
-            plane[edge.ravel()] = nothing
+            plane[gaps.spoilt] = nothing
             self.device.write(self._coefficients, to, plane)
         else:
-            self._coefficients[to : to + self._plane][edge.ravel()] = nothing
+            self._coefficients[to : to + self._plane][gaps.spoilt] = nothing
 
     def set_mask(self, mask: NDArray[np.bool_] | None) -> None:
         """Pixels [rows, cols] of the block that belong to the surface; None: all."""
@@ -213,19 +210,44 @@ def _filters(device: Device, rows: int, pitch: int, degree: int) -> tuple[Filter
     return along_y, along_x, padded, device.zeros(rows * pitch + 2 * r + pitch)
 
 
-def _filled(image: Array, valid: NDArray[np.bool_]) -> Array:
-    """The image with invalid pixels replaced by the nearest valid one to the left, else to the right, else above."""
-    cols = np.arange(image.shape[1])
-    left = np.maximum.accumulate(np.where(valid, cols, -1), axis=1)
-    right = np.minimum.accumulate(np.where(valid, cols, image.shape[1])[:, ::-1], axis=1)[:, ::-1]
-    nearest = np.where(left >= 0, left, np.where(right < image.shape[1], right, 0))
-    filled = np.take_along_axis(image, nearest, axis=1)
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """Pixels of an image block that hold no grey value: beyond the image, or not finite. Mostly the same ones in every
+    frame.
+
+    ``valid`` [rows, cols]. ``filled``: their elements in the padded image, which take the values of the elements
+    ``source`` of the image. ``spoilt``: elements of the plane of coefficients that have no meaning.
+    """
+
+    valid: NDArray[np.bool_]
+    filled: NDArray[np.intp]
+    source: NDArray[np.intp]
+    spoilt: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, valid: NDArray[np.bool_], pitch: int, radius: int) -> Gaps:
+        """For planes of ``pitch``, and filters of ``radius``: that much at the edges lacks neighbours."""
+        rows, cols = valid.shape
+        spoilt = np.ones((rows, pitch), bool)
+        inner = slice(radius, rows - radius), slice(radius, cols - radius)
+        spoilt[inner] = _dilated(~valid, SPOILT)[inner]
+        y, x = np.nonzero(~valid) if valid.any() else (np.empty(0, np.intp), np.empty(0, np.intp))
+        return cls(valid.copy(), (y + radius) * pitch + x, _nearest(valid)[y, x], spoilt.ravel())
+
+
+def _nearest(valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """For each pixel the valid one to take: itself, the nearest to the left, else to the right, else of another row."""
+    rows, cols = valid.shape
+    x = np.arange(cols)
+    left = np.maximum.accumulate(np.where(valid, x, -1), axis=1)
+    right = np.minimum.accumulate(np.where(valid, x, cols)[:, ::-1], axis=1)[:, ::-1]
+    found = np.where(left >= 0, left, np.where(right < cols, right, 0)) + cols * np.arange(rows)[:, None]
     some: NDArray[np.bool_] = np.asarray(valid.any(axis=1))
-    if not some.all() and some.any():
-        rows: NDArray[np.intp] = np.flatnonzero(some)
-        distance = np.abs(np.subtract.outer(np.arange(some.size), rows))
-        filled = filled[rows[distance.argmin(axis=1)]]
-    return np.ascontiguousarray(filled)
+    with_some: NDArray[np.intp] = np.flatnonzero(some)
+    if with_some.size:
+        distance = np.abs(np.subtract.outer(np.arange(rows), with_some))
+        found = found[with_some[distance.argmin(axis=1)]]
+    return np.asarray(found, np.intp)
 
 
 def _dilated(spoilt: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
