@@ -1,8 +1,7 @@
-"""The plan of the refinement: what is refined where, what is refused, memory and maps."""
+"""The plan of the refinement: what is refined where, what is refused, and maps."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -146,16 +145,3 @@ def test_refusals_name_value_limit_and_way_out(of: dict[str, Any], options: dict
 def test_the_largest_thinning_is_allowed() -> None:
     assert refined(thin=4).across == 9
     assert refined(window=65, thin=8).across == 9
-
-
-def test_memory_holds_the_coefficients_and_the_wider_block() -> None:
-    """One band of 40 x 24 pixels, a pixel more around it; 9 frames of 9 cameras in single precision."""
-    options = {"model": "affine-4d", "stride": 1, "roi": (30, 30, 70, 54), "tile": 24, "arrays": "depth"}
-    without, found = plan(**options, refine=0), plan(**options, refine=3)
-    assert found.refine is not None
-    halo = found.refine.halo
-    rows, cols = 24 + 2 + 2 * halo, 40 + 2 + 2 * halo
-    pitch = 64 * math.ceil(cols / 64)
-    own = without.problem.sampling.x.radius + without.problem.sampling.x.filter_radius
-    wider = rows * cols - (24 + 2 + 2 * own) * (40 + 2 + 2 * own)
-    assert found.bytes - without.bytes == 9 * 9 * rows * pitch * 4 + len(without.cameras[1]) * wider * 5
