@@ -3,7 +3,7 @@ any scene is worse off than before."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -128,6 +128,17 @@ def worse(pair: Pair, name: str) -> tuple[int, int]:
     return int(np.count_nonzero(known & (after > before + std))), int(np.count_nonzero(np.isfinite(before + after)))
 
 
+def by_chance(pair: Pair, names: Iterable[str], draws: int = 100) -> float:
+    """The share that independent, normal errors of the sizes that the error bars state would give."""
+    rng, shares = np.random.default_rng(0), []
+    for name in names:
+        before, after = (field[f"{name}_std"][~pair.kept] for field in (pair.start, pair.refined))
+        known = np.isfinite(before) & np.isfinite(after)
+        one, two = (rng.standard_normal((draws, known.sum())) * std[known] for std in (before, after))
+        shares.append(np.mean(np.abs(two) > np.abs(one) + np.hypot(before[known], after[known])))
+    return float(np.mean(shares))
+
+
 def every_scene(quick: bool) -> dict[str, tuple[Scene, dict[str, Any]]]:
     """Scenes and views of which all pixels count: borders between faces, too."""
     sinusoid = scenes.sinusoid(windows=2)
@@ -158,7 +169,9 @@ def measure_worse(settings: Settings, quick: bool) -> Outcome:
         }
         lost, n = (sum(count[i] for count in counts.values()) for i in (0, 1))
         worst = max(counts, key=lambda name: counts[name][0])
-        note = f"most of them {worst}: {counts[worst][0]} of {counts[worst][1]}"
+        note = (
+            f"most of them {worst}: {counts[worst][0]} of {counts[worst][1]}; by chance {by_chance(pair, counts):.3g}"
+        )
         figures += [
             Figure(f"{label}: worse by more than a standard error", lost / n, "", 0.01, note=note),
             Figure(f"{label}: pixels that kept the affine result", float(np.mean(pair.kept)), ""),
