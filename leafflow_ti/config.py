@@ -55,6 +55,7 @@ _AutoTaps = Annotated[Literal["auto", "3x1x1", "3", "5", "7"], BeforeValidator(s
 _AutoOdd = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 1, odd=True))]
 _AutoCount = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 1))]
 _AutoSteps = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 0, high=50))]
+_AutoDegree = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 5, odd=True, high=7))]
 _AutoRefined = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, REFINED_WINDOW, odd=True))]
 _Width = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -154,7 +155,7 @@ class RefineSection(_Section):
     steps: _AutoSteps = "auto"
     window: _AutoRefined = "auto"
     thin: _AutoCount = "auto"
-    spline: Annotated[Literal[5, 7] | _Auto, BeforeValidator(lambda v: int(v) if str(v) in ("5", "7") else v)] = "auto"
+    spline: _AutoDegree = "auto"
 
 
 class PlanSection(_Section):
