@@ -11,6 +11,7 @@ import functools
 from types import SimpleNamespace
 
 from leafflow_ti.kernels.engine import lane_type, ti
+from leafflow_ti.kernels.refine_equations import equation_functions
 from leafflow_ti.kernels.refine_tables import DERIVATIVES, FUNCTIONS, NOTHING, SHIFTS, Scalar, Size, Value, Warp
 from leafflow_ti.kernels.refine_warp import warp_functions
 from leafflow_ti.kernels.spec import KernelSpec
@@ -32,14 +33,7 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
     reach = float(taps // 2 - 1)
     real, precise, lanes = spec.real, spec.precise, spec.lanes
     V = lane_type(real, lanes)
-    scalars = warp_functions(spec).scalars
-
-    @ti.func
-    def total(v: ti.template()):
-        """Sum over the lanes."""
-        if ti.static(lanes > 1):
-            return v.sum()
-        return v
+    scalars, total = warp_functions(spec).scalars, equation_functions(spec).total
 
     @ti.func
     def gain(at: ti.i32, terms: ti.i32, x: ti.template(), y: ti.template(), r: ti.template()):
