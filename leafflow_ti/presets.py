@@ -21,7 +21,7 @@ class Preset(NamedTuple):
 PRESETS: dict[str, Preset] = {
     "fast": Preset("f32", stride=4),
     "balanced": Preset("f32", stride=1, steps=3),
-    "accurate": Preset("f64", stride=1, steps=8, thin=2),
+    "accurate": Preset("f64", stride=1, steps=8, thin=1),
 }
 
 REFINED_MODEL = "affine-scene-flow"

@@ -50,7 +50,7 @@ def refinement(config: RunConfig) -> tuple[object, ...]:
 
 @pytest.mark.parametrize(
     ("preset", "precision", "steps", "thin", "stride", "unrefined_stride"),
-    [("fast", "f32", 0, 3, 4, 4), ("balanced", "f32", 3, 3, 4, 1), ("accurate", "f64", 8, 2, 4, 1)],
+    [("fast", "f32", 0, 3, 4, 4), ("balanced", "f32", 3, 3, 4, 1), ("accurate", "f64", 8, 1, 4, 1)],
 )
 def test_preset_decides_what_is_not_given(
     preset: str, precision: str, steps: int, thin: int, stride: int, unrefined_stride: int
@@ -75,7 +75,7 @@ def test_explicit_values_win_over_the_preset() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "window", "thin", "accurate"), [(3, 9, 1, 1), (41, 41, 1, 1), (65, 65, 3, 2), (129, 129, 6, 2)]
+    ("size", "window", "thin", "accurate"), [(3, 9, 1, 1), (41, 41, 1, 1), (65, 65, 3, 1), (129, 129, 6, 1)]
 )
 def test_refinement_follows_the_window(size: int, window: int, thin: int, accurate: int) -> None:
     assert refinement(resolved(window=size)) == (3, window, thin)

@@ -20,7 +20,7 @@ from perf.dissertation.measure import EDGE_PX
 from perf.figures import Figure, Outcome
 from perf.refinement.common import STANDARD, Pair, mean, measure, rms
 
-QUALITIES = {"balanced": (3, 3), "accurate": (8, 2)}
+QUALITIES = {"balanced": (3, 3), "accurate": (8, 1)}
 """Most Gauss-Newton steps and thinning as of the presets, images in single precision for both."""
 
 
