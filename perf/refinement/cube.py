@@ -20,8 +20,8 @@ from perf.dissertation.measure import EDGE_PX
 from perf.figures import Figure, Outcome
 from perf.refinement.common import STANDARD, Pair, mean, measure, rms
 
-QUALITIES = {"balanced": (3, 3), "accurate": (8, 1)}
-"""Most Gauss-Newton steps and thinning as of the presets, images in single precision for both."""
+QUALITIES = {"balanced": (3, 3, "f32"), "accurate": (8, 1, "f64")}
+"""Most Gauss-Newton steps, thinning and precision as of the presets."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,17 @@ class Settings:
     thin: int = 3
     stride: int = CUBE_VIEW["stride"]
     deformation: str = "auto"
+    precision: str = "f32"
 
     def options(self) -> dict[str, Any]:
         """Options of ``estimate``."""
-        return {**CUBE_VIEW, "thin": self.thin, "stride": self.stride, "deformation": self.deformation}
+        return {
+            **CUBE_VIEW,
+            "thin": self.thin,
+            "stride": self.stride,
+            "deformation": self.deformation,
+            "precision": self.precision,
+        }
 
 
 def faces(pair: Pair, scene: CubeScene) -> dict[str, Any]:
@@ -181,7 +188,10 @@ def measure_worse(settings: Settings, quick: bool) -> Outcome:
 
 def _qualities(of: Callable[[Settings, str], Outcome], quick: bool) -> Outcome:
     stride = 16 if quick else CUBE_VIEW["stride"]
-    outcomes = [of(Settings(steps, thin, stride), name) for name, (steps, thin) in QUALITIES.items()]
+    outcomes = [
+        of(Settings(steps, thin, stride, precision=precision), name)
+        for name, (steps, thin, precision) in QUALITIES.items()
+    ]
     return Outcome(tuple(figure for one in outcomes for figure in one.figures), {"stride": stride, **QUALITIES})
 
 
