@@ -7,6 +7,7 @@ from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.refine_equations import equation_functions
 from leafflow_ti.kernels.refine_tables import (
     FUNCTIONS,
+    GROWTH,
     MAX_UNKNOWNS,
     SHIFTS,
     TERMS,
@@ -169,8 +170,14 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
     def change_gains(slot: ti.template(), factor: precise, size: ti.template(), P: ti.template(), p: ti.template()):
         """The photometric terms' own step, given that of the unknowns."""
         s, n, groups, terms = scalars(slot, size), size[Size.UNKNOWNS], size[Size.IMAGE_GROUPS], size[Size.TERMS]
-        whole = p[s + Scalar.MASS]
+        whole, product = p[s + Scalar.MASS], slot.precise + size[Size.PRODUCT]
         for g in range(groups):
+            for b in range(SHIFTS):
+                moved = V(0.0)
+                for i in range(n):
+                    at = slot.precise + size[Size.MOVES] + (b * n + i) * groups + g
+                    moved = moved + P[at] * p[s + Scalar.STEP + i]
+                P[product + b] = moved
             share = P[slot.precise + size[Size.MASS] + g] * (1.0 / whole)
             enough = ti.select(share > V(0.1), V(1.0), V(0.0)) / ti.max(share, V(0.1))
             # M^-1 b by the factor, in place of b.
@@ -190,11 +197,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             for m in range(terms):
                 change = P[sums + m * groups] * enough
                 for b in range(SHIFTS):
-                    moved = V(0.0)
-                    for i in range(n):
-                        at = slot.precise + size[Size.MOVES] + (b * n + i) * groups + g
-                        moved = moved + P[at] * p[s + Scalar.STEP + i]
-                    change = change + moved * p[s + Scalar.SOLVED + m * SHIFTS + b]
+                    change = change + P[product + b] * p[s + Scalar.SOLVED + m * SHIFTS + b]
                 at = slot.precise + size[Size.GAIN_STEP] + m * groups + g
                 P[at] = change * factor
                 at = slot.precise + size[Size.GAIN] + m * groups + g
@@ -237,7 +240,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.STEP + i] = 0.0 - p[s + Scalar.RIGHT + i] * p[s + Scalar.SCALE + i]
             if p[s + Scalar.FIXED + i] > 0.5:
                 p[s + Scalar.STEP + i] = precise(0.0)
-                if size[Size.LIST + i] < 12:
+                if size[Size.LIST + i] < GROWTH:
                     lost = precise(1.0)
         substitute(s + Scalar.NORMAL, n, s + Scalar.STEP, 1, p)
         square = precise(0.0)
@@ -268,7 +271,8 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def solve(slot: ti.template(), size: ti.template(), value: ti.template(), P: ti.template(), p: ti.template()):
-        """Judge the pass, and go a step further, or half a step back; the pass after the last one only judges."""
+        """Judge the pass, and go a step further, or half the last step back. The last of the allowed steps is judged by
+        its size: it is not looked at again."""
         s = scalars(slot, size)
         p[s + Scalar.PASSES] += 1.0
         p[s + Scalar.SAMPLINGS] += p[s + Scalar.RESAMPLE]
@@ -331,7 +335,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
         slot: ti.template(), pixel: ti.i32, size: ti.template(), value: ti.template(), P: ti.template(),
         p: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Results and their covariance ``σ² H^-1 S H^-1``; NaN rows where the data do not determine an unknown."""
+        """Results and their covariance ``σ² H^-1 S H^-1``; rows of -1 where the data do not determine an unknown."""
         s, n = scalars(slot, size), size[Size.UNKNOWNS]
         to = pixel * Out.N
         out[to + Out.CODE], out[to + Out.PASSES] = p[s + Scalar.CODE], p[s + Scalar.PASSES]
