@@ -10,6 +10,7 @@ import numpy as np
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.filters import gaussian_radius
+from leafflow_ti.kernels.refine_tables import ADDRESSED
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.range_plan import RangePlan
 from leafflow_ti.refine_plan import Refinement
@@ -43,6 +44,15 @@ class Demand:
     n_maps: int
     cols: int
 
+    def coefficients(self, rows: int) -> int:
+        """Spline coefficients of the refinement for units of ``rows`` rows."""
+        if self.refine is None:
+            return 0
+        band = Band.of(self.problem.sampling, rows + 2, self.cols + 2, int(self.config.window.stride))
+        widening = 2 * self.refine.widening(band.halo_y, band.halo_x)
+        plane = (band.in_rows + widening) * round_up(band.in_cols + widening, 64)
+        return len(self.refine.frames) * self.n_cameras * plane
+
     def bytes(self, rows: int, ahead: int) -> int:
         """Memory for units of ``rows`` rows while ``ahead`` frames are read ahead."""
         config, problem, ranges = self.config, self.problem, self.ranges
@@ -59,10 +69,10 @@ class Demand:
             total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize, gpu=gpu)
         in_rows, in_cols = read.in_rows, read.in_cols
         if self.refine:
-            wide = Band(band.rows, band.cols, band.stride, self.refine.halo, self.refine.halo)
-            in_rows, in_cols = max(in_rows, wide.in_rows), max(in_cols, wide.in_cols)
+            widening = self.refine.widening(band.halo_y, band.halo_x)
+            in_rows, in_cols = in_rows + 2 * widening, in_cols + 2 * widening
             planes = len(self.refine.frames) * self.n_cameras
-            total += planes * wide.in_rows * round_up(wide.in_cols, 64) * itemsize
+            total += planes * in_rows * round_up(in_cols, 64) * itemsize
             total += self._refining(self.refine, itemsize, gpu) + band.rows * band.cols * bytes_per_pixel()
         margin = 0
         if config.filters.prefilter != "none":
@@ -93,22 +103,27 @@ def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int,
     """
     plan, limit = demand.config.plan, usable_memory(demand.config)
     addressed = INDEXED * (4 if demand.config.precision == "f32" else 8)
+
+    def indexed(rows: int) -> bool:
+        return demand.bytes(rows, 0) <= addressed and demand.coefficients(rows) <= ADDRESSED
+
     for ahead in depths:
         if plan.tile != "auto":
             chosen = min(int(plan.tile), rows)
         else:
             chosen = int(np.clip(BAND_PIXELS // demand.cols, 16, rows)) if rows > 16 else rows
-            while chosen > 1 and demand.bytes(chosen, ahead) > min(limit, addressed):
+            while chosen > 1 and not (demand.bytes(chosen, ahead) <= limit and indexed(chosen)):
                 chosen = max(1, chosen * 3 // 4)
             # Bands of equal height: the last one should not be a sliver.
             chosen = -(-rows // -(-rows // chosen))
         needed = demand.bytes(chosen, ahead)
-        if needed <= min(limit, addressed):
+        if needed <= limit and indexed(chosen):
             return chosen, needed, ahead
     if needed <= limit:
+        splines = demand.coefficients(chosen)
         raise ConfigError(
-            f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB, and kernels can address "
-            f"{addressed / 2**20:.0f} MiB: lower plan.tile, or use a roi, a smaller window"
+            f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB and {splines} spline coefficients, kernels address "
+            f"{addressed / 2**20:.0f} MiB and {ADDRESSED} of these: lower plan.tile, or use a roi, a smaller window"
         )
     raise ConfigError(
         f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB, 80 % of plan.max_memory are "

@@ -54,7 +54,7 @@ class Engine:
         ranges = RangeEngine(device, plan.ranges, problem.sampling, first, band) if plan.ranges else None
         read = ranges.outer if ranges else band
         # The refinement sees the same block as the tensors, on every side this much wider.
-        widening = max(0, plan.refine.halo - min(band.halo_y, band.halo_x)) if plan.refine else 0
+        widening = plan.refine.widening(band.halo_y, band.halo_x) if plan.refine else 0
         rows, cols = read.in_rows + 2 * widening, read.in_cols + 2 * widening
         refine = RefineStage(device, plan.refine, first, rows, cols) if plan.refine else None
         prefilter = None

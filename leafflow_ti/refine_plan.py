@@ -64,6 +64,10 @@ class Refinement:
         """Pixels of the images that a measurement needs on each side."""
         return self.size // 2 + self.reach + support(self.degree) + filter_radius(self.degree)
 
+    def widening(self, halo_y: int, halo_x: int) -> int:
+        """Pixels that it needs on every side around a block of a model with these halos."""
+        return max(0, self.halo - min(halo_y, halo_x))
+
     @property
     def names(self) -> tuple[str, ...]:
         """Maps that are measured, in the order of the unknowns; strain rates stand behind the growth they make up."""

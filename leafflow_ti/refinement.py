@@ -42,9 +42,11 @@ class Place:
 
 
 def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place) -> Effort:
-    """Refine every pixel that has a value, in place of ``maps`` [rows, cols] and ``status``; returns what it took.
+    """Refine every pixel whose status is ok, in place of ``maps`` [rows, cols] and ``status``; returns what it took.
 
-    ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at.
+    Texture in one direction alone (aperture) does not determine the motion, and the noise in the texture's gradient
+    would pass for what does: such pixels keep what the model says. ``maps`` hold what the model gives; those that only
+    the refinement gives are there, too, and not looked at.
     """
     rows, cols = np.nonzero(status == Status.OK)
     if not rows.size:

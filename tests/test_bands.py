@@ -7,12 +7,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from test_pipeline import SCENE, capture_of, config
 
 import leafflow_ti as lf
 from leafflow_ti import engines
-from leafflow_ti.capture import Capture
+from leafflow_ti.capture import Capture, Geometry, capture_from_array
+from leafflow_ti.config import load_config
+from leafflow_ti.kernels.refine_tables import ADDRESSED
 from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan
 from leafflow_ti.refine_plan import Refinement
@@ -97,3 +100,19 @@ def test_little_memory_lowers_the_bands_of_a_refinement(capture: Capture) -> Non
     lowered = planned(capture, stride=1, max_memory=limit)
     assert lowered.bands > 1
     assert lowered.bytes <= 0.9 * whole.bytes
+
+
+def test_coefficients_stay_where_kernels_can_index_them() -> None:
+    """9 x 9 cameras of 1600 x 1200 pixels in 25 frames: the arrays of other kernels could be larger."""
+    images = np.broadcast_to(np.zeros(1, np.uint8), (25, 9, 9, 1200, 1600))
+    large = capture_from_array(images, Geometry(2800.0, (799.5, 599.5), (5.0, 5.0)))
+    options = {"model": "affine-5d", "window.size_time": 21}
+    plan = lf.plan_run(
+        large, load_config(overrides={**options, "preshift": (0, 0), "refine": 3, "stride": 16, "max_memory": "200G"})
+    )
+    assert plan.refine is not None
+    rows, cols = (
+        (n + 1) * plan.x.step + 1 + 2 * plan.refine.halo for n in (plan.band_rows, len(plan.x))
+    )  # fmt: skip
+    assert plan.bands > 1
+    assert len(plan.refine.frames) * len(plan.refine.cameras) * rows * cols < ADDRESSED

@@ -9,6 +9,7 @@ from enum import IntEnum, auto
 
 from leafflow_ti.kernels.engine import lane_kernel, lane_type, ti
 from leafflow_ti.kernels.refine_noise import noise_functions
+from leafflow_ti.kernels.refine_results import result_functions
 from leafflow_ti.kernels.refine_samples import sample_functions
 from leafflow_ti.kernels.refine_solve import solve_functions
 from leafflow_ti.kernels.refine_tables import FUNCTIONS, SHIFTS, Scalar, Size
@@ -45,7 +46,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
     """
     real, precise, lanes = spec.real, spec.precise, spec.lanes
     warps, samples, solver = warp_functions(spec), sample_functions(spec, taps), solve_functions(spec)
-    noises = noise_functions(spec)
+    noises, results = noise_functions(spec), result_functions(spec)
     scalars = warps.scalars
     reals, precises = lane_type(real, lanes), spec.element
 
@@ -83,7 +84,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
             noises.spread_noise(slot, i, size, value, r, p)
         for i in range(SHIFTS):
             noises.noise(slot, i, size, r, p)
-        solver.finish(slot, pixel, size, value, P, p, out)
+        results.finish(slot, pixel, size, value, P, p, out)
 
     @ti.func
     def one_stage(
@@ -103,7 +104,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
         elif ti.static(stage == Stage.NOISE):
             noises.noise(slot, i, size, r, p)
         elif ti.static(stage == Stage.FINISH):
-            solver.finish(slot, pixel, size, value, P, p, out)
+            results.finish(slot, pixel, size, value, P, p, out)
         elif p[scalars(slot, size) + Scalar.DONE] < 0.5:
             if ti.static(stage == Stage.AIM):
                 warps.aim(slot, size, value, p)

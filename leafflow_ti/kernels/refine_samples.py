@@ -12,12 +12,22 @@ from types import SimpleNamespace
 
 from leafflow_ti.kernels.engine import lane_type, ti
 from leafflow_ti.kernels.refine_equations import equation_functions
-from leafflow_ti.kernels.refine_tables import DERIVATIVES, FUNCTIONS, NOTHING, SHIFTS, Scalar, Size, Value, Warp
+from leafflow_ti.kernels.refine_tables import (
+    ADDRESSED,
+    DERIVATIVES,
+    FUNCTIONS,
+    NOTHING,
+    SHIFTS,
+    Scalar,
+    Size,
+    Value,
+    Warp,
+)
 from leafflow_ti.kernels.refine_warp import warp_functions
 from leafflow_ti.kernels.spec import KernelSpec
 
-NO_WRAP = 0x3FFFFFFF
-"""Elements of the coefficients lie below. An index that is known to be positive and small needs no extension of its own
+NO_WRAP = ADDRESSED - 1
+"""An index that is known to be positive and small needs no extension of its own
 for each neighbour: measured, three quarters of the time of an interpolation."""
 
 MOST_IMAGES = 0.8

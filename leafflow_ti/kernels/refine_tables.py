@@ -184,5 +184,7 @@ class Out(IntEnum):
     N = COVARIANCE + MAX_UNKNOWNS * MAX_UNKNOWNS
 
 
+ADDRESSED = 1 << 30
+"""Coefficients that a pixel can be sampled from: their indices are cut to so many."""
 NOTHING = 1e30
 """Stands for a value that there is none of, in coefficients and warped images."""
