@@ -122,7 +122,7 @@ def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int,
     if needed <= limit:
         splines = demand.coefficients(chosen)
         raise ConfigError(
-            f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB and {splines} spline coefficients, kernels address "
+            f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB and {splines} spline coefficients; kernels take "
             f"{addressed / 2**20:.0f} MiB and {ADDRESSED} of these: lower plan.tile, or use a roi, a smaller window"
         )
     raise ConfigError(
