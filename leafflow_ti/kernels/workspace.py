@@ -235,6 +235,7 @@ class Number(IntEnum):
     STEP = auto()
     PITCH = auto()
     REWEIGHTED = auto()  # windows are weighted anew; what begins with CELL or SOURCE means something only then
+    ROBUST = auto()  # rows of own flows that contradict the reference's are left out
     EVERYWHERE = auto()  # in every pixel, else where the plain fit failed
     PENALTY = auto()  # a Penalty
     CELLS_X = auto()  # cells of the window along x, y
@@ -298,6 +299,9 @@ class Value(IntEnum):
     FLOOR = auto()  # px²: mean squared displacement that models leave out
     FAILED = auto()  # residual per floor above which the plain fit failed
     RELAXATION = auto()  # factor of a relaxation step
+    MAX_CONTRADICTION = (
+        auto()
+    )  # mean squared difference of an own flow's rows, per variance, from the reference's motion
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9

@@ -107,7 +107,7 @@ class Cells:
     @property
     def values(self) -> Array:
         """What the table ``value`` gets: factors of terms and noises; along x, then along y the weights of the cells
-        and what a narrow window makes of them, powers of their middles, and the mean powers of their samples' offsets."""
+        and further ones of a narrow window, powers of their middles, and mean powers of their samples' offsets."""
         factors = [[term[3] for entry in self.entries for term in entry], [noise[3] for noise in self.noises]]
         blocks = (self.request.sampling.x.blocked, self.request.sampling.y.blocked)
         return np.concatenate([*factors, *(self._along(b) for b in blocks)])

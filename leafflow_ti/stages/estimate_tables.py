@@ -84,6 +84,10 @@ FAILED = 3.0
 RELAXATION = 1.5
 """Factor of a step of over-relaxation; converges between 0 and 2."""
 
+MAX_CONTRADICTION = 16.0
+"""Mean squared difference, in error bars, between a camera's own flow and the reference's motion, above which a robust
+estimate is taken to be of another surface."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -322,7 +326,9 @@ class ProblemTables:
         from leafflow_ti.kernels.workspace import Number, Value
 
         problem = self.problem
-        self._set_numbers(tables.number, REWEIGHTED=len(self._cells) > 0)
+        own = problem.own_flows
+        compared = self._estimator.robust and own is not None and own.reference_rows
+        self._set_numbers(tables.number, REWEIGHTED=len(self._cells) > 0, ROBUST=compared)
         if not self._cells:
             return tables
         cells, planes = self._cells[min(request, 1)], self._sources[request]
@@ -342,6 +348,7 @@ class ProblemTables:
         value[Value.SCALE_START], value[Value.SCALE_SHRINK], value[Value.SCALE_LEAST] = (
             SCALE_START, SCALE_SHRINK, SCALE_LEAST
         )  # fmt: skip
+        value[Value.MAX_CONTRADICTION] = MAX_CONTRADICTION
         value[Value.FLOOR], value[Value.FAILED], value[Value.RELAXATION] = FLOOR_PX**2, FAILED, RELAXATION
         return Tables(number.astype(np.int32), value)
 
