@@ -94,11 +94,14 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         gain = precise(0.0)
         for j in range(k):
             gain += value[p.v + Value.NOISE + n - k + j] / ti.cast(k, precise)
-        floor = ti.max(energy * (0.5 * value[p.v + Value.FLOOR] / gain), V(value[p.v + Value.NOISE_LEVEL]))
+        energy = energy * (precise(0.5) / gain)
+        level = value[p.v + Value.NOISE_LEVEL]
         least = region(p, number, Region.LEAST_SQUARED)
         if p.which < AGAIN:
-            ws[least] = ti.max(floor * value[p.v + Value.SCALE_LEAST], V(1e-30))
-            failed = residual > floor * value[p.v + Value.FAILED]
+            lowest = energy * value[p.v + Value.LEAST_DISPLACED] + level * value[p.v + Value.LEAST_NOISE]
+            ws[least] = ti.max(lowest, V(1e-30))
+            most = energy * value[p.v + Value.MOST_DISPLACED] + level * value[p.v + Value.MOST_NOISE]
+            failed = residual > most
             if kind < Weights.PENALTY or number[p.n + Number.EVERYWHERE] == 1:
                 failed = energy > V(0.0)
             ws[region(p, number, Region.ACTIVE)] = ti.select(failed, V(1.0), V(0.0))

@@ -295,9 +295,10 @@ class Value(IntEnum):
     NOISE_LEVEL = auto()  # variance of the images' noise, 0 where it is not known
     SCALE_START = auto()  # σ² of the penalty: first one, per mean squared residual
     SCALE_SHRINK = auto()  # from one round to the next
-    SCALE_LEAST = auto()  # least one, per floor of the residual
-    FLOOR = auto()  # px²: mean squared displacement that models leave out
-    FAILED = auto()  # residual per floor above which the plain fit failed
+    LEAST_NOISE = auto()  # least one: per variance of the noise, and
+    LEAST_DISPLACED = auto()  # per squared gradient, px²
+    MOST_NOISE = auto()  # largest squared residual of a plain fit that did not fail, likewise
+    MOST_DISPLACED = auto()
     RELAXATION = auto()  # factor of a relaxation step
     MAX_CONTRADICTION = (
         auto()

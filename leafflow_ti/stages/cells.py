@@ -21,7 +21,7 @@ from leafflow_ti.stages.channels import MASS, MapKey, Request
 from leafflow_ti.stages.windows import BlockMap
 
 Array = NDArray[np.float64]
-NARROW = 0.4
+NARROW = 0.3
 """Width of a narrow window's further weights, per width of the window."""
 Source = tuple[BlockMap, int]
 """A block sum, and the power of the frames' offsets that it is weighted by over time."""
