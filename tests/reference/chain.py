@@ -29,40 +29,53 @@ def filters_see(valid, sampling: Sampling):
     return minimum_filter(valid.astype(float), size, mode="nearest")
 
 
-def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels, valid=None):
-    """J [n, N, N] by direct sums of d d^T over the window around each pixel (x, y), middle camera and frame.
+def window_of(images, sampling: Sampling, columns: ColumnSet, pixel, valid=None):
+    """Data vectors [N, t, sy, sx, y, x] of the window around a pixel (x, y), middle camera and frame; which samples
+    count, [t, 1, 1, y, x].
 
-    Samples whose filters see a pixel that is not ``valid`` [t, y, x] have no weight.
+    There are several vectors where columns are shared. Samples whose filters see a pixel that is not ``valid``
+    [t, y, x] do not count.
     """
-    channels = {c: derivative(images, sampling, c) for c in columns.channels}
-    centre = {a: images.shape[ARRAY_AXIS[a]] // 2 for a in ("t", "sy", "sx")}
-    half = {a: sampling.axis(a).size // 2 for a in AXES}
-    offsets = {a: np.arange(-half[a], half[a] + 1, dtype=float) for a in AXES}
-    grids = dict(zip(ARRAY_AXIS, np.meshgrid(*(offsets[a] for a in ARRAY_AXIS), indexing="ij"), strict=True))
-    weight = np.ones(next(iter(grids.values())).shape)
-    for a in ARRAY_AXIS:
-        shape = [1] * 5
-        shape[ARRAY_AXIS[a]] = -1
-        weight = weight * np.array(sampling.axis(a).weights).reshape(shape)
+    reach = {a: sampling.axis(a).size // 2 for a in ARRAY_AXIS}
+    where = {a: images.shape[ARRAY_AXIS[a]] // 2 for a in ("t", "sy", "sx")} | dict(zip("xy", pixel, strict=True))
+    window = {a: slice(where[a] - reach[a], where[a] + reach[a] + 1) for a in ARRAY_AXIS}
+    channels = {c: derivative(images, sampling, c)[tuple(window.values())] for c in columns.channels}
+    grids = offsets(sampling)
+    vectors = []
+    for number in sorted({term.vector for column in columns.columns for term in column.terms}):
+        d = np.zeros((columns.n, *grids["t"].shape))
+        for i, column in enumerate(columns.columns):
+            for term in (term for term in column.terms if term.vector == number):
+                d[i] += term.factor * channels[term.channel] * monomial(grids, term.exponents)
+        vectors.append(d)
     seen = np.ones((len(images), *images.shape[3:])) if valid is None else filters_see(valid, sampling)
+    return vectors, seen[window["t"], window["y"], window["x"]][:, None, None]
+
+
+def offsets(sampling: Sampling):
+    """Offset of every sample of the window from its centre, by axis, each [t, sy, sx, y, x]."""
+    along = [np.arange(n, dtype=float) - n // 2 for n in (sampling.axis(a).size for a in ARRAY_AXIS)]
+    return dict(zip(ARRAY_AXIS, np.meshgrid(*along, indexing="ij"), strict=True))
+
+
+def monomial(grids, exponents):
+    """``Δ^exponents`` of every sample."""
+    return np.prod([grids[a] ** e for a, e in zip(AXES, exponents, strict=True)], axis=0)
+
+
+def window_weights(sampling: Sampling):
+    """Weight of every sample of the window [t, sy, sx, y, x]."""
+    return np.einsum("i,j,k,l,m", *(np.array(sampling.axis(a).weights) for a in ARRAY_AXIS))
+
+
+def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels, valid=None):
+    """J [n, N, N] by direct sums of d d^T over the window around each pixel (x, y), see ``window_of``."""
     result = []
-    for x, y in pixels:
-        where = {**centre, "x": x, "y": y}
-        window = tuple(slice(where[a] - half[a], where[a] + half[a] + 1) for a in ARRAY_AXIS)
-        d = []
-        for column in columns.columns:
-            d.append({})
-            for term in column.terms:
-                value = term.factor * channels[term.channel][window]
-                for a, e in zip(AXES, term.exponents, strict=True):
-                    value *= grids[a] ** e
-                d[-1][term.vector] = d[-1].get(term.vector, 0.0) + value.ravel()
-        counted = (weight * seen[window[0], None, None, window[3], window[4]]).ravel()
-        J = np.zeros((columns.n, columns.n))
-        for vector in {v for values in d for v in values}:
-            one = np.array([values.get(vector, np.zeros(counted.size)) for values in d])
-            J += (one * counted) @ one.T
-        result.append(J)
+    for pixel in pixels:
+        vectors, seen = window_of(images, sampling, columns, pixel, valid)
+        weights = (window_weights(sampling) * seen).ravel()
+        flat = [d.reshape(columns.n, -1) for d in vectors]
+        result.append(sum((d * weights) @ d.T for d in flat))
     return np.array(result)
 
 
