@@ -15,6 +15,7 @@ from leafflow_ti.models import TensorLayout
 from leafflow_ti.range_plan import RangePlan
 from leafflow_ti.refine_plan import Refinement
 from leafflow_ti.runtime import DENSE_LANES, usable_threads
+from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.planes import round_up
 from leafflow_ti.stages.prefilter import prefilter_bytes
 from leafflow_ti.stages.problem import Problem
@@ -61,7 +62,8 @@ class Demand:
         band = Band.of(problem.sampling, rows + 2, self.cols + 2, int(config.window.stride))
         own = problem.own_flows.requests if problem.own_flows else ()
         gpu = config.arch not in ("auto", "cpu")
-        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize, own, gpu)
+        weighed = ESTIMATORS[problem.estimator].weighs
+        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize, own, gpu, weighed)
         read = band
         if ranges and ranges.depth and ranges.layout:
             depth = ranges.depth

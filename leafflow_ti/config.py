@@ -38,7 +38,11 @@ Brightness = Literal["none", "temporal", "spatial", "camera"]
 Deformation = Literal["auto", "none", "growth", "strain"]
 BrightnessTerms = Literal["none", "time", "space", "both"]
 Constraint = Literal["int", "grad", "intgrad", "taylor"]
-Estimator = Literal["ols", "tls", "tls-equilibrated"]
+Estimator = Literal[
+    "ols", "tls", "tls-equilibrated", "sampson", "fns", "for3", "robust-ols", "robust-ols-sor", "robust-tls"
+]
+Penalty = Literal["lorentzian", "geman-mcclure", "truncated"]
+Robust = Literal["failed", "all"]
 Solver = Literal["fast", "jacobi"]
 Prefilter = Literal["none", "highpass", "homomorphic"]
 Border = Literal["full", "clip"]
@@ -71,6 +75,9 @@ class ModelSection(_Section):
     any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can. ``deformation`` growth:
     the patch may grow in its plane, one more unknown; auto: where the flows of all cameras, or the refinement, are
     there to tell. strain: in the refinement it may stretch in its plane, three more unknowns.
+
+    ``scale`` of the coordinates in a window, for estimators that depend on it: tls, sampson, fns. ``penalty`` on the
+    residuals of the robust estimators, which estimate anew where the plain fit ``failed``, or ``all`` pixels.
     """
 
     name: ModelName = "auto"
@@ -81,6 +88,9 @@ class ModelSection(_Section):
     brightness_terms: BrightnessTerms = "none"
     estimator: Estimator = "tls-equilibrated"
     solver: Solver = "fast"
+    scale: _Width = 1.0
+    penalty: Penalty = "lorentzian"
+    robust: Robust = "failed"
     weighting: Weighting = "wls"
 
     @field_validator("rows")

@@ -14,6 +14,7 @@ from leafflow_ti.plan import Plan
 from leafflow_ti.range_engine import RangeEngine, Sample
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import EstimateStage, View
+from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.prefilter import Prefilter
 from leafflow_ti.stages.refine import RefineStage
 from leafflow_ti.stages.tensor import Band, TensorStage
@@ -49,7 +50,8 @@ class Engine:
         if kept is not None and not plan.ranges:
             return kept
         own = problem.own_flows.requests if problem.own_flows else ()
-        tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band, own)
+        weighed = ESTIMATORS[problem.estimator].weighs
+        tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band, own, weighed)
         first = view(tensor.out_pitch)
         ranges = RangeEngine(device, plan.ranges, problem.sampling, first, band) if plan.ranges else None
         read = ranges.outer if ranges else band
@@ -60,7 +62,7 @@ class Engine:
         prefilter = None
         if filters.prefilter != "none":
             prefilter = Prefilter(device, filters.prefilter, filters.sigma_pre, rows, cols)
-        estimate = EstimateStage(device, problem, plan.layout, first, plan.differences, apart)
+        estimate = EstimateStage(device, problem, plan.layout, first, plan.differences, apart, tensor.sources)
         return cls(key, prefilter, tensor, estimate, ranges, refine, widening)
 
     def reset(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from leafflow_ti.capture import Capture
 from leafflow_ti.config import RunConfig
@@ -55,8 +56,14 @@ def model_problem(capture: Capture, config: RunConfig, name: str, motion: str | 
             )
     return Problem(
         columns, sampling, config.model.estimator, config.model.solver, config.model.weighting == "wls",
-        offsets, use_range, fitted, own,
+        offsets, use_range, fitted, own, **weighing(config),
     )  # fmt: skip
+
+
+def weighing(config: RunConfig) -> dict[str, Any]:
+    """What estimators that weigh windows anew, or work in raw units, are told."""
+    model = config.model
+    return {"scale": model.scale, "penalty": model.penalty, "robust": model.robust}
 
 
 def fitted_motion(config: RunConfig, name: str) -> str | None:

@@ -9,6 +9,7 @@ import numpy as np
 from leafflow_ti.capture import Capture
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError, InputError
+from leafflow_ti.model_plan import weighing
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.range_flow import columns, images, smoothed_samples, white_noise, window_radius
 from leafflow_ti.range_source import GivenRange, open_range
@@ -116,5 +117,5 @@ def range_problem(
     share = 1 / (chosen.beta**2 * plan.samples)
     scale = (working / geometry.f_px, working / window_radius(sampling))
     found = columns(chosen.constraint, sampling, model.brightness_terms, share)
-    problem = Problem(found, sampling, model.estimator, model.solver, fitted=3, range_scale=scale)
+    problem = Problem(found, sampling, model.estimator, model.solver, fitted=3, range_scale=scale, **weighing(config))
     return problem, plan

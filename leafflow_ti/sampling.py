@@ -197,6 +197,11 @@ def noise_gain(sampling: Sampling, channel: str) -> float:
     return float(np.prod([np.sum(sampling.axis(a).kernel(a == channel) ** 2) for a in AXES]))
 
 
+def channel_noise(sampling: Sampling, columns: ColumnSet, channel: str) -> float:
+    """The same, also of channels that are made of several images."""
+    return columns.derived[channel].gain if channel in columns.derived else noise_gain(sampling, channel)
+
+
 def white_smoothness(sampling: Sampling) -> float:
     """Share of the gradient's energy that smoothing in x and y once more leaves of white noise; 1 without smoothing."""
 
@@ -214,12 +219,12 @@ def column_noise(sampling: Sampling, columns: ColumnSet) -> Array:
     squares are centred.
     """
 
-    def gain(channel: str) -> float:
-        return columns.derived[channel].gain if channel in columns.derived else noise_gain(sampling, channel)
-
     def of(column: Column) -> float:
         return sum(
-            p.factor * q.factor * gain(p.channel) * sampling.moment(_sum(p.exponents, q.exponents))
+            p.factor
+            * q.factor
+            * channel_noise(sampling, columns, p.channel)
+            * sampling.moment(_sum(p.exponents, q.exponents))
             for p, q in product(column.terms, repeat=2)
             if (p.channel, p.vector) == (q.channel, q.vector)
         )

@@ -170,7 +170,7 @@ class Stages:
 
 def _up_to_parameters(device: Device, plan: Plan, view: View) -> EstimateStage:
     """The part of the estimate up to the flow parameters and their residuals; it writes no maps."""
-    from leafflow_ti.kernels.stages import Stage
+    from leafflow_ti.kernels.numbers import Stage
 
     stage = EstimateStage(device, plan.problem, plan.layout, view)
     stage._steps = list(itertools.takewhile(lambda step: step.stage != Stage.CLEAN, stage._steps))

@@ -61,7 +61,19 @@ Depth = Annotated[
     _text("depth", "OUT.zarr|STACK|PATTERN", "Range flow: range maps in mm, such as z_{t:03d}.tif [from the cameras]."),
 ]
 Estimator = Annotated[
-    str | None, _text("estimator", "ols|tls|tls-equilibrated", "Estimator of the flow parameters [tls-equilibrated].")
+    str | None,
+    _text(
+        "estimator", "NAME",
+        "ols, tls, tls-equilibrated, sampson, fns, for3, robust-ols, robust-ols-sor or robust-tls [tls-equilibrated].",
+    ),
+]  # fmt: skip
+Scale = Annotated[float | None, _text("scale", "K", "Scale of the coordinates for tls, sampson, fns [1].")]
+Penalty = Annotated[
+    str | None,
+    _text("penalty", "lorentzian|geman-mcclure|truncated", "Robust estimators: how residuals count [lorentzian]."),
+]
+Robust = Annotated[
+    str | None, _text("robust", "failed|all", "Robust estimators: pixels whose plain fit failed, or all [failed].")
 ]
 Solver = Annotated[str | None, _text("solver", "fast|jacobi", "Null-space solver [fast].")]
 Weighting = Annotated[str | None, _text("weighting", "wls|ls", "3D fit weighted by covariance, or not [wls].")]
@@ -116,8 +128,8 @@ Sets = Annotated[
 SETTINGS: dict[str, Any] = {
     "preset": Preset, "model": Model, "motion": Motion, "deformation": Deformation, "rows": Rows,
     "brightness": Brightness, "brightness_terms": BrightnessTerms, "constraint": Constraint, "beta": Beta,
-    "depth": Depth, "estimator": Estimator, "solver": Solver, "weighting": Weighting, "window": Window,
-    "sigma": Sigma, "stride": Stride, "border": Border,
+    "depth": Depth, "estimator": Estimator, "scale": Scale, "penalty": Penalty, "robust": Robust, "solver": Solver,
+    "weighting": Weighting, "window": Window, "sigma": Sigma, "stride": Stride, "border": Border,
     "refine": Refine, "refine_window": RefineWindow, "thin": Thin, "taps": Taps, "prefilter": Prefilter,
     "sigma_pre": SigmaPre, "frames": Frames, "roi": Roi, "mask": Mask, "preshift": Preshift,
     "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads,

@@ -40,9 +40,12 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
             for c in range(r + 1):
                 s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride] * s
+                noise = V(ti.select(r == c, value[p.v + Value.NOISE + r], precise(0.0)))
+                if number[p.n + Number.REWEIGHTED] == 1:
+                    noise = ws[region(p, number, Region.WEIGHT_NOISE) + tri(r, c) * p.stride]
                 if r == c:
                     floor = floor + element * value[p.v + Value.RIDGE]
-                    element = element - quietest * (value[p.v + Value.DENOISE] * value[p.v + Value.NOISE + r] * s)
+                element = element - quietest * noise * (value[p.v + Value.DENOISE] * s)
                 ws[packed + tri(r, c) * p.stride] = element
         least = region(p, number, Region.FLOOR)
         ws[least] = ti.max(floor + quietest * precise(1e-3), V(1e-30))

@@ -66,22 +66,29 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def solve(ws: ti.template(), l: ti.i32, x: ti.i32, n: ti.i32, m: ti.i32, stride: ti.i32):
-        """``X := (L L^T)^-1 X`` for the factor at ``l`` and X [n, m] at ``x``.
+        """``X := (L L^T)^-1 X`` for the factor at ``l`` and X [n, m] at ``x``."""
+        substitute(ws, l, x, n, m, 0, 2, stride)
 
-        Forward and backward substitution are one loop over both directions: inlined code is compiled once per call.
+    @ti.func
+    def substitute(
+        ws: ti.template(), l: ti.i32, x: ti.i32, n: ti.i32, m: ti.i32, begin: ti.i32, end: ti.i32, stride: ti.i32
+    ):
+        """Directions ``begin`` to ``end - 1`` of: forward (0) ``X := L^-1 X``, backward (1) ``X := L^-T X``.
+
+        Both are one loop over the directions: inlined code is compiled once per call.
         Here and below columns go in pairs (an odd last one twice): two sums at a time hide each other's latency.
         """
-        for backward in range(2):
+        for backward in range(begin, end):
             for step in range(n):
                 r = ti.select(backward == 1, n - 1 - step, step)
                 first = ti.select(backward == 1, r + 1, 0)
-                begin = ti.select(backward == 1, tri(r + 1, r), tri(r, 0))
+                start = ti.select(backward == 1, tri(r + 1, r), tri(r, 0))
                 inverse = ws[l + tri(r, r) * stride]
                 for pair in range((m + 1) // 2):
                     here = x + (r * m + 2 * pair) * stride
                     beside = ti.select(2 * pair + 1 < m, stride, 0)
                     one, two = ws[here], ws[here + beside]
-                    place = begin  # along row r of the factor, or down its column r
+                    place = start  # along row r of the factor, or down its column r
                     for k in range(first, first + step):
                         factor, at = ws[l + place * stride], x + (k * m + 2 * pair) * stride
                         one = one - factor * ws[at]
@@ -95,12 +102,17 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         """``X := M^-1 X`` once, or ``M^-1 X M^-1`` with ``times`` = 2, for symmetric X [n, n] and the factor of M."""
         for _ in range(times):
             solve(ws, l, x, n, n, stride)
-            for r in range(n):
-                for c in range(r):
-                    one, two = x + (r * n + c) * stride, x + (c * n + r) * stride
-                    kept = ws[one]
-                    ws[one] = ws[two]
-                    ws[two] = kept
+            transpose(ws, x, n, stride)
+
+    @ti.func
+    def transpose(ws: ti.template(), x: ti.i32, n: ti.i32, stride: ti.i32):
+        """``X := X^T`` for X [n, n]."""
+        for r in range(n):
+            for c in range(r):
+                one, two = x + (r * n + c) * stride, x + (c * n + r) * stride
+                kept = ws[one]
+                ws[one] = ws[two]
+                ws[two] = kept
 
     @ti.func
     def upper_times(ws: ti.template(), l: ti.i32, x: ti.i32, y: ti.i32, n: ti.i32, m: ti.i32, stride: ti.i32):
@@ -257,6 +269,8 @@ def dense(spec: KernelSpec) -> SimpleNamespace:
         times_small=times_small,
         cholesky=cholesky,
         solve=solve,
+        substitute=substitute,
+        transpose=transpose,
         upper_times=upper_times,
         symmetric_times=symmetric_times,
         add_product=add_product,

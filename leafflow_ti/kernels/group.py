@@ -7,11 +7,14 @@ every step is a launch of its own and every thread a pixel.
 
 import functools
 
+from leafflow_ti.kernels.dense import dense
 from leafflow_ti.kernels.engine import lane_kernel, ti
 from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
+from leafflow_ti.kernels.workspace import Region
 
-STEP = 4
-"""Entries of a step: stage, argument, first entry of its table ``number``, and of its table ``value``."""
+STEP = 5
+"""Entries of a step: stage, argument, first entry of its table ``number``, and of its table ``value``; 1 if it is only
+for groups with a pixel whose window is weighted anew."""
 
 
 @ti.dataclass
@@ -34,14 +37,15 @@ def region(p: ti.template(), number: ti.template(), name: ti.template()) -> ti.i
 
 
 @functools.cache
-def group_kernel(spec: KernelSpec, stages: tuple):
+def group_kernel(spec: KernelSpec, stages: tuple, long: bool = False):
     """A kernel: the stages ``(p, number, value, ws, J, out)`` that the steps name, for every group of a batch.
 
     ``row_groups`` groups cover a row of the output, ``pitch`` pixels are stored of it. A step's stage counts in
     ``stages``; with a single stage it does not matter. Group g of a task works at ``task task_step + g group_step`` of
-    the workspace.
+    the workspace. ``long``: see ``LaneKernel``.
     """
     real, precise, lanes, element = spec.real, spec.precise, spec.lanes, spec.element
+    any_lane = dense(spec).any_lane
 
     @ti.func
     def run_steps(
@@ -54,10 +58,13 @@ def group_kernel(spec: KernelSpec, stages: tuple):
                 base=base, stride=stride, pixel=pixel, n_pixels=n_pixels, which=steps[STEP * s + 1],
                 n=steps[STEP * s + 2], v=steps[STEP * s + 3],
             )  # fmt: skip
+            code = steps[STEP * s]
+            if steps[STEP * s + 4] == 1 and any_lane(ws[region(p, number, Region.ACTIVE)] > element(0.5)) == 0:
+                code = -1
             if ti.static(len(stages) == 1):
-                stages[0](p, number, value, ws, J, out)
+                if code >= 0:
+                    stages[0](p, number, value, ws, J, out)
             else:
-                code = steps[STEP * s]
                 for index in ti.static(range(len(stages))):
                     if code == index:
                         stages[index](p, number, value, ws, J, out)
@@ -68,7 +75,7 @@ def group_kernel(spec: KernelSpec, stages: tuple):
         row = group // row_groups
         return row * pitch + (group - row * row_groups) * lanes
 
-    @lane_kernel(lanes)
+    @lane_kernel(lanes, long=long)
     def groups(
         first_group: ti.i32,
         n_groups: ti.i32,

@@ -22,7 +22,7 @@ ROUNDS = 6
 @functools.cache
 def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``load``, ``scale``, ``least_squares``, ``factorise``, ``accept``, ``inverse_iteration``, ``jacobi``,
-    ``parameters``, ``residuals`` and ``centre``."""
+    ``parameters``, ``residuals``, ``centre``, and of other estimators ``whiten``, ``unwhiten`` and ``fundamental``."""
     precise, lanes, V = spec.precise, spec.lanes, spec.element
     small = dense(spec)
 
@@ -43,39 +43,48 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                 for i in ti.static(range(lanes)):
                     element[i] = ti.cast(J[begin + i], precise)
             ws[moments + k * p.stride] = element
+        ws[region(p, number, Region.CONVERGED)] = V(0.0)
 
     @ti.func
-    def scaled(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
-        """Element (r, c), r >= c, of ``S J S``."""
-        at = region(p, number, Region.MOMENTS) + number[p.n + Number.LOWER + tri(r, c)] * p.stride
-        return ws[at] * (value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c])
+    def left_out(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
+        """Whether a column with an offset is among the two while ``which`` says that these do not count."""
+        return ti.cast(
+            p.which == 1 and number[p.n + Number.CONSTANT + r] + number[p.n + Number.CONSTANT + c] < 2, ti.i32
+        )
 
     @ti.func
     def scale(
         p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
         out: ti.template(),
     ):  # fmt: skip
-        """``A = S J S``, packed, with a ridge."""
+        """``A = S J S``, packed, with a ridge; ``which`` = 1: columns with an offset have no part in it."""
         n = number[p.n + Number.N]
-        packed = region(p, number, Region.TENSOR)
+        packed, moments = region(p, number, Region.TENSOR), region(p, number, Region.MOMENTS)
         trace = V(0.0)
         for r in range(n):
             for c in range(r + 1):
-                element = scaled(r, c, p, number, value, ws)
+                factor = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
+                if r != c and left_out(r, c, p, number) == 1:
+                    factor = precise(0.0)
+                element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride] * factor
                 ws[packed + tri(r, c) * p.stride] = element
                 if r == c:
                     trace = trace + element
         for r in range(n):
             at = packed + tri(r, r) * p.stride
             ws[at] = ws[at] + trace * value[p.v + Value.RIDGE]
+            if left_out(r, r, p, number) == 1:
+                ws[at] = ws[at] + trace
 
     @ti.func
     def factorise(
         p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
         out: ti.template(),
     ):  # fmt: skip
-        """Factor A."""
-        small.cholesky(ws, region(p, number, Region.TENSOR), number[p.n + Number.N], -1, p.stride)
+        """Factor A, and keep it."""
+        n, packed = number[p.n + Number.N], region(p, number, Region.TENSOR)
+        small.copy(ws, packed, region(p, number, Region.MATRIX), n * (n + 1) // 2, p.stride)
+        small.cholesky(ws, packed, n, -1, p.stride)
 
     @ti.func
     def least_squares(
@@ -86,7 +95,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
         n, k, flow = number[p.n + Number.N], number[p.n + Number.SOLUTIONS], number[p.n + Number.FLOW]
         block = number[p.n + Number.BLOCK]
         factor, vectors = region(p, number, Region.TENSOR), region(p, number, Region.VECTORS)
-        ws[region(p, number, Region.CONVERGED)] = V(0.0)
+        unsolved(p, number, ws)
         for j in range(block):
             for back in range(n):
                 r = n - 1 - back
@@ -103,6 +112,13 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                         element = element - ws[one] * ws[vectors + (m * block + j) * p.stride]
                     element = element * ws[factor + tri(r, r) * p.stride]
                 ws[vectors + (r * block + j) * p.stride] = element
+
+    @ti.func
+    def unsolved(p: ti.template(), number: ti.template(), ws: ti.template()):
+        """A new solution is wanted: where windows are weighted anew only there."""
+        flag = region(p, number, Region.CONVERGED)
+        if number[p.n + Number.REWEIGHTED] == 1:
+            ws[flag] = ti.select(ws[region(p, number, Region.ACTIVE)] > V(0.5), V(0.0), ws[flag])
 
     @ti.func
     def accept(
@@ -202,10 +218,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
         n, k = number[p.n + Number.N], number[p.n + Number.SOLUTIONS]
         full = region(p, number, Region.FULL)
         if any_left(p, number, ws) == 1:
-            for r in range(n):
-                for c in range(n):
-                    element = scaled(ti.max(r, c), ti.min(r, c), p, number, value, ws)
-                    ws[full + (r * n + c) * p.stride] = element
+            small.unpack(ws, region(p, number, Region.MATRIX), full, n, p.stride)
             small.jacobi(ws, full, n, JACOBI_SWEEPS, p.stride)
             small.sort_eigen(ws, full, n, k, p.stride)
             all_lanes = V(0.0) < V(1.0)
@@ -247,9 +260,28 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
             for r in range(n):
                 at = vectors + (r * k + j) * p.stride
                 ws[at] = ws[at] * inverse
+        chosen = V(1.0)
+        if number[p.n + Number.REWEIGHTED] == 1:
+            chosen = ws[region(p, number, Region.ACTIVE)]
         for j in range(k):
             for f in range(flow):
-                ws[target + (j * flow + f) * p.stride] = ws[vectors + (f * k + j) * p.stride]
+                at = target + (j * flow + f) * p.stride
+                ws[at] = ti.select(chosen > V(0.5), ws[vectors + (f * k + j) * p.stride], ws[at])
+
+    @ti.func
+    def weighted_noise(
+        j: ti.i32, k: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
+    ):
+        """``p^T N p`` of solution j, whose scaled entries are column j of the vectors [n, k]."""
+        vectors, noise = region(p, number, Region.VECTORS), region(p, number, Region.WEIGHT_NOISE)
+        norm = V(0.0)
+        for r in range(number[p.n + Number.N]):
+            one = ws[vectors + (r * k + j) * p.stride] * value[p.v + Value.SCALE + r]
+            for c in range(r + 1):
+                both = one * ws[vectors + (c * k + j) * p.stride]
+                twice = value[p.v + Value.SCALE + c] * ti.select(r == c, precise(1.0), precise(2.0))
+                norm = norm + both * ws[noise + tri(r, c) * p.stride] * twice
+        return norm
 
     @ti.func
     def residuals(
@@ -269,6 +301,8 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                     element = ws[found + (j * flow + r) * p.stride] * unit
                 norm = norm + element * element * (value[p.v + Value.NOISE + r] / (unit * unit))
                 ws[vectors + (r * k + j) * p.stride] = element
+            if number[p.n + Number.REWEIGHTED] == 1:
+                norm = weighted_noise(j, k, p, number, value, ws)
             ws[region(p, number, Region.VARIANCE) + j * p.stride] = norm
         small.upper_times(ws, region(p, number, Region.TENSOR), vectors, images, n, k, p.stride)
         for j in range(k):
@@ -290,7 +324,66 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                 square = first + number[p.n + Number.CENTRE + 2 * term + 1] * p.stride
                 ws[at] = ws[at] + ws[square] * value[p.v + Value.CENTRE + term]
 
+    @ti.func
+    def whiten(
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
+    ):  # fmt: skip
+        """``A := L^-1 A L^-T`` with ``L L^T = S N S``, for ``A v = λ N v`` as an eigenproblem; ``which``: see ``scale``."""
+        n = number[p.n + Number.N]
+        packed, factor = region(p, number, Region.TENSOR), region(p, number, Region.NOISE_FACTOR)
+        noise, full = region(p, number, Region.WEIGHT_NOISE), region(p, number, Region.FULL)
+        for r in range(n):
+            for c in range(r + 1):
+                scale = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
+                element = ws[noise + tri(r, c) * p.stride] * scale
+                if left_out(r, c, p, number) == 1:
+                    element = V(ti.cast(r == c, precise))
+                ws[factor + tri(r, c) * p.stride] = element
+        small.cholesky(ws, factor, n, -1, p.stride)
+        small.unpack(ws, packed, full, n, p.stride)
+        for _ in range(2):
+            small.substitute(ws, factor, full, n, n, 0, 1, p.stride)
+            small.transpose(ws, full, n, p.stride)
+        for r in range(n):
+            for c in range(r + 1):
+                ws[packed + tri(r, c) * p.stride] = ws[full + (r * n + c) * p.stride]
+
+    @ti.func
+    def unwhiten(
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
+    ):  # fmt: skip
+        """Eigenvectors of the whitened matrix become those of the pair of matrices."""
+        solution, factor = region(p, number, Region.SOLUTION), region(p, number, Region.NOISE_FACTOR)
+        small.substitute(ws, factor, solution, number[p.n + Number.N], number[p.n + Number.SOLUTIONS], 1, 2, p.stride)
+
+    @ti.func
+    def fundamental(
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
+        out: ti.template(),
+    ):  # fmt: skip
+        """The eigenvectors of ``S (M - N) S`` whose eigenvalues are nearest to 0, by full Jacobi."""
+        n, k = number[p.n + Number.N], number[p.n + Number.SOLUTIONS]
+        moments, noise = region(p, number, Region.MOMENTS), region(p, number, Region.WEIGHT_NOISE)
+        full = region(p, number, Region.FULL)
+        for r in range(n):
+            for c in range(n):
+                one, two = ti.max(r, c), ti.min(r, c)
+                element = ws[moments + number[p.n + Number.LOWER + tri(one, two)] * p.stride]
+                element = element - ws[noise + tri(one, two) * p.stride]
+                scale = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
+                ws[full + (r * n + c) * p.stride] = element * scale
+        small.jacobi(ws, full, n, JACOBI_SWEEPS, p.stride)
+        for r in range(n):
+            at = full + (r * n + r) * p.stride
+            ws[at] = small.magnitude(ws[at])
+        small.sort_eigen(ws, full, n, k, p.stride)
+        unsolved(p, number, ws)
+        keep(full + n * n * p.stride, n, V(0.0) < V(1.0), p, number, ws)
+
     stages = (
         load, scale, factorise, least_squares, accept, inverse_iteration, jacobi, parameters, residuals, centre,
+        whiten, unwhiten, fundamental,
     )  # fmt: skip
     return SimpleNamespace(**{f.__name__: f for f in stages})

@@ -18,6 +18,10 @@ def texture_function(spec: KernelSpec):
         energy = region(p, number, Region.MOMENTS) + (number[p.n + Number.EXTRA] + 1) * p.stride
         plain, smooth = ws[energy], ws[energy + p.stride]
         some = plain > V(0.0)
-        return ti.select(some, ti.min(smooth / ti.select(some, plain, V(1.0)), V(1.0)), V(1.0))
+        share = ti.select(some, ti.min(smooth / ti.select(some, plain, V(1.0)), V(1.0)), V(1.0))
+        if number[p.n + Number.REWEIGHTED] == 1:
+            # The same noise, by fewer or more unequal samples.
+            share = share * ws[region(p, number, Region.SPREAD)]
+        return share
 
     return smoothness

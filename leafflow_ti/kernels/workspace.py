@@ -26,6 +26,7 @@ class Region(IntEnum):
 
     MOMENTS = 0  # [entries + extras]: the tensor's distinct entries, window mass, energies
     TENSOR = auto()  # packed [N]: scaled structure tensor, then its Cholesky factor
+    MATRIX = auto()  # packed [N]: what was factored
     VECTORS = auto()  # [N, BLOCK]: iterated vectors
     IMAGES = auto()  # [N, BLOCK]: factor times vectors
     RITZ = auto()  # [BLOCK, BLOCK]
@@ -73,6 +74,19 @@ class Region(IntEnum):
     LEFT = auto()  # [3, G + F, Q]: by the errors of the geometry, of the reference's normal equations
     RIGHT = auto()  # [3, G + F, Q]: what is correlated with them
     REFERENCE_VARIANCE = auto()  # [1]
+    ACTIVE = auto()  # [1]: 1 where the window is weighted anew; from here on: empty unless windows are
+    SPREAD = auto()  # [1]: what the weights make of the variance of the normal equations' noise
+    SHARE = auto()  # [1]: mean weight
+    SCALE_SQUARED = auto()  # [1]: σ² of the penalty
+    LEAST_SQUARED = auto()  # [1]: the least that it may become
+    WEIGHT_NOISE = auto()  # packed [N]: Σ w ω C, as the tensor now is; of the fundamental scheme what it takes off
+    NOISE_FACTOR = auto()  # packed [N]: its factor, scaled
+    QUADRATIC = auto()  # [entries]: the mean squared residual as a function of the tensor's entries
+    RELATIVE = auto()  # [monomials]: the mean relative noise as a function of the offset
+    WEIGHT_SUMS = auto()  # [entries, then 2 x monomials]: of weighted cells; of their offsets' monomials
+    CELL = auto()  # [sources]: block sums of one cell
+    CELL_ENTRIES = auto()  # [entries]: the cell's own tensor
+    DIAGONAL = auto()  # [N]: of the scaled tensor before any weights
     OUT = auto()  # [n_maps]: what the maps get
 
 
@@ -82,7 +96,7 @@ class Layout:
 
     ``moments``: planes of the largest tensor. ``rows_t`` and ``motion``: the largest numbers of motion rows and of
     equations of any camera. ``unknowns`` of the motion fit; ``correlated``: columns whose noise cameras share;
-    ``maps``: output planes.
+    ``maps``: output planes; ``sources``, ``monomials``: of the largest cell where windows are weighted anew, else 0.
     """
 
     n: int
@@ -95,6 +109,8 @@ class Layout:
     unknowns: int
     correlated: int
     maps: int
+    sources: int = 0
+    monomials: int = 0
 
     @property
     def sizes(self) -> dict[Region, int]:
@@ -102,6 +118,7 @@ class Layout:
         n, k, terms, motion, q = self.n, self.k, self.terms, self.motion, self.unknowns
         s, t, errors = self.rows_s, self.rows_t, self.terms + self.correlated
         flow = n - k
+        anew = int(self.sources > 0)
 
         def packed(m: int) -> int:
             return m * (m + 1) // 2
@@ -109,6 +126,7 @@ class Layout:
         return {
             Region.MOMENTS: self.moments,
             Region.TENSOR: packed(n),
+            Region.MATRIX: packed(n),
             Region.VECTORS: n * BLOCK,
             Region.IMAGES: n * BLOCK,
             Region.RITZ: BLOCK * BLOCK,
@@ -156,6 +174,19 @@ class Layout:
             Region.LEFT: 3 * errors * q,
             Region.RIGHT: 3 * errors * q,
             Region.REFERENCE_VARIANCE: 1,
+            Region.ACTIVE: anew,
+            Region.SPREAD: anew,
+            Region.SHARE: anew,
+            Region.SCALE_SQUARED: anew,
+            Region.LEAST_SQUARED: anew,
+            Region.WEIGHT_NOISE: anew * packed(n),
+            Region.NOISE_FACTOR: anew * packed(n),
+            Region.QUADRATIC: anew * self.moments,
+            Region.RELATIVE: self.monomials,
+            Region.WEIGHT_SUMS: anew * self.moments + 2 * self.monomials,
+            Region.CELL: self.sources,
+            Region.CELL_ENTRIES: anew * self.moments,
+            Region.DIAGONAL: anew * n,
             Region.OUT: self.maps,
         }
 
@@ -203,6 +234,23 @@ class Number(IntEnum):
     OUT_Y = auto()
     STEP = auto()
     PITCH = auto()
+    REWEIGHTED = auto()  # windows are weighted anew; what begins with CELL or SOURCE means something only then
+    EVERYWHERE = auto()  # in every pixel, else where the plain fit failed
+    PENALTY = auto()  # a Penalty
+    CELLS_X = auto()  # cells of the window along x, y
+    CELLS_Y = auto()
+    CELL_STEP_X = auto()  # cells from one output pixel to the next
+    CELL_STEP_Y = auto()
+    SOURCES = auto()  # block sums of a cell
+    SOURCES_AT = auto()  # where their planes begin among the tensors
+    SOURCE_PLANE = auto()  # distance of the planes
+    SOURCE_PITCH = auto()
+    MASS_SOURCE = auto()  # which of them counts valid pixels
+    CELL_MONOMIALS = auto()  # of the noise's covariance
+    CELL_NOISES = auto()  # its terms
+    CELL_TERMS = auto()  # terms of all entries
+    CELL_LISTS = auto()  # where the lists of ``stages.cells`` begin behind this table's first entry
+    CELL_VALUES = auto()  # likewise in the table of values
     EXTRA = auto()  # first of the moments behind the tensor's: window mass, energies
     FLOW_ROWS = auto()  # 2: columns of the motion itself
     OFFSET_CODES = FLOW_ROWS + 2  # 6: offset of each motion row: 0 = "1", 1.. = AXES
@@ -215,7 +263,8 @@ class Number(IntEnum):
     MOVE = CENTRE + 2 * MAX_SQUARES  # 2 x 2: columns of the flow's derivatives along x, y
     PARTNER = MOVE + 4  # MAX_COLUMNS: column of an own flow for each column of the reference model, or -1
     PLACE = PARTNER + MAX_COLUMNS  # MAX_UNKNOWNS: where each component of the motion stands among the unknowns, or -1
-    LOWER = PLACE + MAX_UNKNOWNS  # N (N + 1) / 2: plane of each element of the lower triangle
+    CONSTANT = PLACE + MAX_UNKNOWNS  # MAX_COLUMNS: 1 for columns without an offset
+    LOWER = CONSTANT + MAX_COLUMNS  # N (N + 1) / 2: plane of each element of the lower triangle
     # Behind them NOISE_TERMS x 2: element of the lower triangle, moment.
 
 
@@ -242,6 +291,13 @@ class Value(IntEnum):
     MAX_SHIFT = auto()  # px per step or frame, likewise
     MOTION_SCALE = auto()  # 2: mm per px of range flow's U', V', and of W
     GAP = MOTION_SCALE + 2  # convergence: residual per gap
+    NOISE_LEVEL = auto()  # variance of the images' noise, 0 where it is not known
+    SCALE_START = auto()  # σ² of the penalty: first one, per mean squared residual
+    SCALE_SHRINK = auto()  # from one round to the next
+    SCALE_LEAST = auto()  # least one, per floor of the residual
+    FLOOR = auto()  # px²: mean squared displacement that models leave out
+    FAILED = auto()  # residual per floor above which the plain fit failed
+    RELAXATION = auto()  # factor of a relaxation step
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9

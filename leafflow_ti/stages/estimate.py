@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -9,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.kernels.numbers import Stage
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.runtime import Device
+from leafflow_ti.stages.cells import SourcePlanes
 from leafflow_ti.stages.estimate_tables import ProblemTables, View
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import Problem
@@ -27,12 +30,13 @@ TASKS_PER_THREAD = 4
 
 @dataclass(frozen=True)
 class _Step:
-    """A stage, its argument, and which tables it works with; ``part``: "solve" or "fit"."""
+    """A stage, its argument, and which tables it works with; ``part``: "solve" or "fit"; ``anew``: as of a Move."""
 
     stage: int
     which: int
     tables: int
     part: str
+    anew: bool
 
 
 class EstimateStage:
@@ -40,18 +44,19 @@ class EstimateStage:
 
     One tensor of the reference model, and one of each camera's own flow where the problem has them. ``differences``:
     the covariances of the velocity's difference quotients are wanted, too; growth needs them. ``apart``: the steps of
-    each part (solve, fit) are launched apart, as always on a GPU, so that their times can be told.
+    each part (solve, fit) are launched apart, as always on a GPU, so that their times can be told. ``sources``: of the
+    tensor stage, for estimators that weigh windows anew.
     """
 
     def __init__(
         self, device: Device, problem: Problem, layout: TensorLayout, view: View, differences: bool = True,
-        apart: bool = False,
+        apart: bool = False, sources: Sequence[SourcePlanes] = (),
     ):  # fmt: skip
         from leafflow_ti.kernels.maps import Output
 
         self.device, self.problem, self.view, self.differences = device, problem, view, differences
         self.apart = apart or device.gpu
-        self._tables = ProblemTables(device, problem, layout)
+        self._tables = ProblemTables(device, problem, layout, sources)
         self.layout = self._tables.layout
         self._steps = self._make_steps()
         self.set_view(view)
@@ -79,7 +84,7 @@ class EstimateStage:
         numbers, values = (np.cumsum([0, *map(len, parts)]) for parts in (
             [t.number for t in tables], [t.value for t in tables]
         ))  # fmt: skip
-        steps = [n for s in self._steps for n in (s.stage, s.which, numbers[s.tables], values[s.tables])]
+        steps = [n for s in self._steps for n in (s.stage, s.which, numbers[s.tables], values[s.tables], s.anew)]
         self._on_device = (
             self.device.array(steps, "int"), self.device.array(np.concatenate([t.number for t in tables]), "int"),
             self.device.array(np.concatenate([t.value for t in tables]), "algebra"),
@@ -88,17 +93,17 @@ class EstimateStage:
     def _make_steps(self) -> list[_Step]:
         """What is done to every group of pixels."""
         from leafflow_ti.kernels.patch_fit import CLEAR, COVARIANCE, DIFFERENCES, FINISH, START
-        from leafflow_ti.kernels.stages import Stage
 
         problem, own = self.problem, self.problem.own_flows
         steps: list[_Step] = []
 
-        def add(stage: Stage, which: int = 0, tables: int = 0) -> None:
-            steps.append(_Step(stage, which, tables, "solve" if stage <= Stage.ROW_COVARIANCE else "fit"))
+        def add(stage: Stage, which: int = 0, tables: int = 0, anew: bool = False) -> None:
+            fits = Stage.ROW_COVARIANCE < stage <= Stage.EMIT
+            steps.append(_Step(stage, which, tables, "fit" if fits else "solve", anew))
 
         def solve(tables: int) -> None:
-            for stage, raw in ESTIMATORS[problem.estimator](problem.solver):
-                add(stage, tables=tables + self._tables.raw if raw else tables)
+            for move in ESTIMATORS[problem.estimator].moves(problem.solver):
+                add(move.stage, move.which, tables + self._tables.raw if move.raw else tables, move.anew)
             add(Stage.CLEAN, tables=tables)
 
         errors = COVARIANCE | (DIFFERENCES if self.differences else 0)
@@ -133,12 +138,12 @@ class EstimateStage:
 
     def _launches(self) -> list[tuple[Any, int, int, str]]:
         """Kernel, first step, end, and part of what is launched for a batch."""
-        from leafflow_ti.kernels.stages import Stage, stage_kernel
+        from leafflow_ti.kernels.stages import stage_kernel
 
         spec, steps = self.device.dense, self._steps
         if self.device.gpu:
             return [(stage_kernel(spec, Stage(s.stage)), i, i + 1, s.part) for i, s in enumerate(steps)]
-        kernel = stage_kernel(spec)
+        kernel = stage_kernel(spec, reweighted=ESTIMATORS[self.problem.estimator].weighs)
         if not self.apart:
             return [(kernel, 0, len(steps), "estimate")]
         runs, first = [], 0

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.kernels.numbers import Penalty
 from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import (
@@ -21,19 +22,20 @@ from leafflow_ti.sampling import (
     shared_noise,
     white_smoothness,
 )
+from leafflow_ti.stages.cells import Cells, SourcePlanes
+from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, OwnFlows, Problem
+from leafflow_ti.stages.windows import taps
 
+PENALTIES = {
+    "lorentzian": Penalty.LORENTZIAN, "geman-mcclure": Penalty.GEMAN_MCCLURE, "truncated": Penalty.TRUNCATED,
+}  # fmt: skip
 RIDGE = {"f64": 1e-13, "f32": 1e-7}
 GUARDED = {1: 2, 2: 4, 3: 4}
 """Vectors that the inverse iteration carries for so many solutions; the guards are what makes it converge."""
 GAP = {"f64": 1e-6, "f32": 1e-3}
-DENOISE = {"ols": 0.0, "tls": 0.0, "tls-equilibrated": 0.9}
-"""Share of the gradients' own noise that the covariances take out of J_ff; OLS divides by J_ff as it is, and the
-residual of raw TLS is no bound for the eigenvalues of the equilibrated tensor.
-
-What noise adds to J_ff is no structure. Taking nearly all of it leaves the matrix definite where there is nothing else,
-and makes the standard errors there ten times larger.
-"""
+DENOISE = {name: estimator.denoise for name, estimator in ESTIMATORS.items()}
+"""Share of the gradients' own noise that the covariances take out of J_ff."""
 MODEL_ERROR = {"1": 0.0, "x": 0.05, "y": 0.05, "sx": 0.03, "sy": 0.03, "t": 0.05, "range": 0.03}
 TURNING_ERROR = 0.01
 """What each equation of the motion fit leaves out: a share of the sizes of its terms, by the offset of its row; and
@@ -70,6 +72,19 @@ def _packed(a: int, b: int) -> int:
     return r * (r + 1) // 2 + c
 
 
+SCALE_START = 4.0
+"""Of the penalty's σ², per mean squared residual of the plain fit: everything counts, more or less."""
+SCALE_SHRINK = 0.5
+SCALE_LEAST = 4.0
+"""Least σ² of the penalty per floor of the squared residual: noise, or what models leave out, whichever is larger."""
+FLOOR_PX = 0.02
+"""Displacement that models leave out: residuals below it are no sign of a failure."""
+FAILED = 3.0
+"""Squared residual per floor from which on the plain fit failed."""
+RELAXATION = 1.5
+"""Factor of a step of over-relaxation; converges between 0 and 2."""
+
+
 @dataclass(frozen=True)
 class View:
     """Camera and output grid of one band: pixel (row, col) lies at (x + step col, y + step row)."""
@@ -104,7 +119,9 @@ class ProblemTables:
 
     FINAL, OWN = 1, 2
 
-    def __init__(self, device: Device, problem: Problem, layout: TensorLayout):
+    def __init__(
+        self, device: Device, problem: Problem, layout: TensorLayout, sources: Sequence[SourcePlanes] = ()
+    ):  # fmt: skip
         from leafflow_ti.kernels.maps import Output
         from leafflow_ti.kernels.spec import EXTRA_PLANES
         from leafflow_ti.kernels.workspace import Layout
@@ -116,13 +133,18 @@ class ProblemTables:
         planes = [len(layout.entries) + EXTRA_PLANES]
         planes += [len(TensorLayout.of(own.columns).entries) + EXTRA_PLANES] * len(own.steps) if own else []
         self._first_plane = np.cumsum([0, *planes]).tolist()
+        self._estimator = ESTIMATORS[problem.estimator]
+        self._cells = [Cells(r) for r in problem.requests(layout)[:2]] if self._estimator.weighs else []
+        self._sources = sources
         self.layout = Layout(
             columns.n, columns.n_time_like, max(planes), len(rows.camera[0]) if rows.camera else 0,
             max(len(rows.motion), *n_rows), len(problem.terms), max(n_rows),
             max(problem.fitted, problem.unknowns + bool(own and own.growth), 3 if problem.range_scale else 1),
             columns.n_flow if own and own.reference_rows else 0, Output.PLANES,
+            max((len(c.sources) for c in self._cells), default=0),
+            max((len(c.monomials) for c in self._cells), default=0),
         )  # fmt: skip
-        self.reference = self._reference_tables(rows, layout)
+        self.reference = self._with_cells(self._reference_tables(rows, layout), 0)
         self.tables = [self.reference]
         if own:
             final = Tables(self.reference.number.copy(), self.reference.value)
@@ -130,8 +152,11 @@ class ProblemTables:
             self._set_unknowns(final.number, own.unknowns, own.growth)
             self.tables += [final, *self._own_tables(own)]
         self.raw = len(self.tables)
-        if problem.estimator == "tls":
-            self.tables += [Tables(t.number.copy(), self._unscaled(t.value)) for t in self.tables]
+        if any(move.raw for move in self._estimator.moves(problem.solver)):
+            owners = [columns, columns, *(own.columns for _ in own.steps)] if own else [columns]
+            self.tables += [
+                Tables(t.number.copy(), self._unscaled(t.value, c)) for t, c in zip(self.tables, owners, strict=True)
+            ]
 
     def _rows(self) -> SimpleNamespace:
         """Columns of the motion rows and of each camera solution's geometry rows; brightness rows stand last."""
@@ -263,8 +288,9 @@ class ProblemTables:
         moves = [own.columns.index(c, o) for c in ("x", "y") for o in ("x", "y")]
         common.number[Number.MOVE : Number.MOVE + 4] = [i for i in moves if i is not None]
         found = []
-        for step, first_plane in zip(own.steps, self._first_plane[1:-1], strict=True):
-            number, value = common.number.copy(), common.value.copy()
+        for camera, (step, first_plane) in enumerate(zip(own.steps, self._first_plane[1:-1], strict=True)):
+            one = self._with_cells(Tables(common.number.copy(), common.value), 1 + camera)
+            number, value = one.number, one.value.copy()
             number[Number.FIRST_PLANE] = first_plane
             value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
             for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
@@ -291,11 +317,40 @@ class ProblemTables:
             value[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
             value[Value.DIFFERENCE : Value.DIFFERENCE + 14] = factors
 
-    @staticmethod
-    def _unscaled(value: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The table ``value`` with unit scales: the tensor in raw units."""
+    def _with_cells(self, tables: Tables, request: int) -> Tables:
+        """The same tables, and how windows are weighted anew; ``request`` counts in the tensor stage."""
+        from leafflow_ti.kernels.workspace import Number, Value
+
+        problem = self.problem
+        self._set_numbers(tables.number, REWEIGHTED=len(self._cells) > 0)
+        if not self._cells:
+            return tables
+        cells, planes = self._cells[min(request, 1)], self._sources[request]
+        blocks = cells.request.sampling.x.blocked, cells.request.sampling.y.blocked
+        self._set_numbers(
+            tables.number, EVERYWHERE=problem.robust == "all", PENALTY=PENALTIES[problem.penalty],
+            CELLS_X=taps(blocks[0]), CELLS_Y=taps(blocks[1]), CELL_STEP_X=planes.step_x, CELL_STEP_Y=planes.step_y,
+            SOURCES=len(cells.sources), SOURCES_AT=planes.start, SOURCE_PLANE=planes.plane, SOURCE_PITCH=planes.pitch,
+            MASS_SOURCE=cells.mass, CELL_MONOMIALS=len(cells.monomials), CELL_NOISES=len(cells.noises),
+            CELL_TERMS=sum(map(len, cells.entries)), CELL_LISTS=len(tables.number) + 1, CELL_VALUES=len(tables.value),
+        )  # fmt: skip
+        number, value = np.concatenate([tables.number, cells.lists]), np.concatenate([tables.value, cells.values])
+        columns = cells.request.columns
+        constant = [max(c.terms[0].exponents) == 0 for c in columns.columns]
+        number[Number.CONSTANT : Number.CONSTANT + columns.n] = constant
+        value[Value.NOISE_LEVEL] = problem.noise**2
+        value[Value.SCALE_START], value[Value.SCALE_SHRINK], value[Value.SCALE_LEAST] = (
+            SCALE_START, SCALE_SHRINK, SCALE_LEAST
+        )  # fmt: skip
+        value[Value.FLOOR], value[Value.FAILED], value[Value.RELAXATION] = FLOOR_PX**2, FAILED, RELAXATION
+        return Tables(number.astype(np.int32), value)
+
+    def _unscaled(self, value: NDArray[np.float64], columns: ColumnSet) -> NDArray[np.float64]:
+        """The table ``value`` for the tensor in raw units: of pixels, or with coordinates in units of 1 / scale."""
         from leafflow_ti.kernels.workspace import MAX_COLUMNS, Value
 
         raw = value.copy()
         raw[Value.SCALE : Value.SCALE + MAX_COLUMNS] = 1.0
+        degrees = [c.terms[0].exponents[0] + c.terms[0].exponents[1] for c in columns.columns]
+        raw[Value.SCALE : Value.SCALE + columns.n] = float(self.problem.scale) ** np.array(degrees)
         return raw

@@ -39,7 +39,9 @@ class Problem:
 
     ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``fitted``: unknowns of the motion fit to the
     reference's rows (0: none), from which a fit with ``own_flows`` starts. ``range_scale``: of range flow, mm per px of
-    (U', V') and of W.
+    (U', V') and of W. ``noise``: standard deviation of the images' noise, grey values, 0 where it is not known;
+    ``scale``: of the coordinates in raw units (section 2.3.3); ``penalty`` and ``robust``: of robust estimators, how
+    residuals count and which pixels are estimated anew.
     """
 
     columns: ColumnSet
@@ -54,6 +56,15 @@ class Problem:
     passes: int = 2
     iterations: int = 4
     range_scale: tuple[float, float] | None = None
+    noise: float = 0.0
+    scale: float = 1.0
+    penalty: str = "lorentzian"
+    robust: str = "failed"
+
+    def requests(self, layout: TensorLayout) -> tuple[Request, ...]:
+        """What the tensor stage is asked for: the reference model's tensor, and those of the own flows."""
+        own = self.own_flows.requests if self.own_flows else ()
+        return (Request(self.columns, layout, self.sampling), *own)
 
     @property
     def unknowns(self) -> int:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from leafflow_ti.models import ColumnSet, TensorLayout
 from leafflow_ti.runtime import MOMENT_LANES, Device
 from leafflow_ti.sampling import Sampling
+from leafflow_ti.stages.cells import Cells, SourcePlanes
 from leafflow_ti.stages.channels import EXTRA_PLANES, FACTOR_PLANES, UNROLLED, Channels, Request
 from leafflow_ti.stages.planes import Terms
 from leafflow_ti.stages.tensor_tables import Band, Lowered, padded_tables
@@ -42,8 +43,9 @@ class TensorStage:
 
     ``push`` takes one frame's block [n_sy, n_sx, in_rows, in_cols] (preshifted) of the cameras that the sampling and
     the ``own`` requests need, and its validity. Once the window is full it returns ``tensors``, one flat
-    device array: the packed tensor [n_entries + EXTRA_PLANES, rows, out_pitch], then those of the own requests; valid
-    until the next call. For ``derived`` columns the block is a stack of images [1, n_images, ...] with its factors.
+    device array: the packed tensor [n_entries + EXTRA_PLANES, rows, out_pitch], then those of the own requests, then,
+    if ``weighed``, the ``sources`` of their cells; valid until the next call. For ``derived`` columns the block is a
+    stack of images [1, n_images, ...] with its factors.
     """
 
     def __init__(
@@ -54,9 +56,11 @@ class TensorStage:
         sampling: Sampling,
         band: Band,
         own: Sequence[Request] = (),
+        weighed: bool = False,
     ):
         self.device, self.band, self.sampling = device, band, sampling
-        lowered = Lowered(*_tables((Request(columns, layout, sampling), *own)), band, device.moments.lanes)
+        requests = (Request(columns, layout, sampling), *own)
+        lowered = Lowered(*_tables(requests), band, device.moments.lanes)
         self._lowered = lowered
         self.n_taps = 2 * sampling.t.filter_radius + 1
         geometry = lowered.geometry
@@ -66,7 +70,11 @@ class TensorStage:
         sizes = lowered.sizes(self._n_tiling, 8 * device.threads)
         self._raw, self._scratch, self._maps, self._sums, self._wide = (self._zeros(n * lanes) for n in sizes[:5])
         self._starts = np.cumsum([0, *sizes[5:]]) * lanes
-        self.tensors = self._zeros(int(self._starts[-1]))
+        cells = [Cells(r, n) for n, r in enumerate(requests)] if weighed else []
+        self.sources = source_planes(lowered, cells, int(self._starts[-1]))
+        """Of each request, where windows are weighted anew."""
+        self.tensors = self._zeros(int(self._starts[-1]) + source_size(lowered, cells))
+        self._source_tables = [self._device_sources(c) for c in cells]
         self._filter_tables = self._device_tables(lowered)
         self._clean_tables = self._tables_without_invalid(lowered)
         self._window_tables = [self._device_windows(w) for w in lowered.windows]
@@ -158,6 +166,8 @@ class TensorStage:
         with span("tensor"):
             for number in range(len(self._window_tables)):
                 self._make_tensor(number)
+            for number in range(len(self._source_tables)):
+                self._make_sources(number)
         return self.tensors
 
     def _add_frame(self, block: NDArray[Any], valid: NDArray[np.bool_], factors: NDArray[Any] | None) -> bool:
@@ -212,6 +222,32 @@ class TensorStage:
             len(lowered.steps), lowered.n_raw, lowered.n_early, g.n_tiles, self._n_tiling, lowered.raw_row,
             g.map_rows, g.halo[0], self._pushed % self.n_taps, g.y.step, g.y.length, g.map_tile, maps_at,
             lowered.scratch, g.halo[1], -(-g.inner // UNROLLED), *tables, *arrays,
+        )  # fmt: skip
+
+    def _device_sources(self, cells: Cells) -> tuple[int, tuple[Any, ...]]:
+        """Sums over the frames of the window of every source of a request's cells: their number, and the tables."""
+        lowered, array, t = self._lowered, self.device.array, self.sampling.t
+        number = {b: n for n, b in enumerate(lowered.block_maps)}
+        terms = Terms.of([
+            [((number[block] * lowered.geometry.map_plane, i), w) for i, w in enumerate(t.window(power).tolist()) if w]
+            for block, power in cells.sources
+        ])  # fmt: skip
+        return len(cells.sources), (
+            array(terms.first, "int"), array([s[0] for s in terms.source], "int"),
+            array([s[1] for s in terms.source], "int"), array(terms.weight),
+        )  # fmt: skip
+
+    def _make_sources(self, number: int) -> None:
+        """The planes of the cells of one request from the maps of the frames of its window."""
+        from leafflow_ti.kernels.sources import sources_kernel
+
+        device, lowered = self.device, self._lowered
+        g, n_t, planes = lowered.geometry, self.sampling.t.size, self.sources[number]
+        n, tables = self._source_tables[number]
+        sources_kernel(device.moments)(
+            n, device.tasks(n * g.block_segment), g.block_segment, g.block_rows, g.block_cols, g.map_pitch,
+            self._n_maps % n_t, n_t, lowered.slot_size, planes.start, planes.plane, planes.pitch, *tables,
+            device.vectors(self._maps, g.lanes), self.tensors,
         )  # fmt: skip
 
     def _make_tensor(self, number: int) -> None:
@@ -285,13 +321,32 @@ class TensorStage:
         )  # fmt: skip
 
 
+def source_planes(lowered: Lowered, cells: list[Cells], start: int) -> tuple[SourcePlanes, ...]:
+    """Where the planes of the requests' cells lie, from element ``start`` on."""
+    g, found = lowered.geometry, []
+    # Lanes beyond the last column of a row look at cells, too.
+    pitch = (g.out_pitch - 1) * g.step_x + taps(g.x)
+    for one in cells:
+        found.append(SourcePlanes(start, g.block_rows * pitch, pitch, g.step_x, g.step_y))
+        start += len(one.sources) * g.block_rows * pitch
+    return tuple(found)
+
+
+def source_size(lowered: Lowered, cells: list[Cells]) -> int:
+    """Elements of all these planes."""
+    planes = source_planes(lowered, cells, 0)
+    return planes[-1].start + len(cells[-1].sources) * planes[-1].plane if cells else 0
+
+
 @functools.lru_cache(maxsize=64)
 def band_bytes(
     columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int,
-    own: tuple[Request, ...] = (), gpu: bool = False,
+    own: tuple[Request, ...] = (), gpu: bool = False, weighed: bool = False,
 ) -> int:  # fmt: skip
     """Memory of the arrays of one band, from raw frames to output maps; a GPU keeps whole planes of every step."""
-    lowered = Lowered(*_tables((Request(columns, layout, sampling), *own)), band, 1 if gpu else MOMENT_LANES)
+    requests = (Request(columns, layout, sampling), *own)
+    lowered = Lowered(*_tables(requests), band, 1 if gpu else MOMENT_LANES)
     lanes = lowered.geometry.lanes
     output = OUTPUT_PLANES * band.rows * lowered.geometry.out_pitch
-    return itemsize * (lanes * sum(lowered.sizes(TASKS, TASKS)) + output)
+    sources = source_size(lowered, [Cells(r, n) for n, r in enumerate(requests)] if weighed else [])
+    return itemsize * (lanes * sum(lowered.sizes(TASKS, TASKS)) + output + sources)

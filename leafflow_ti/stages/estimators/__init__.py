@@ -1,21 +1,24 @@
-"""The estimators of the flow parameters, by name.
-
-An estimator is a function of the solver ("fast" or "jacobi") that returns the stages of a solution: each with whether
-it works on the tensor in raw units. They leave parameters, residual variances and the factor of the equilibrated
-tensor in the workspace.
-"""
+"""The estimators of the flow parameters, by name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from leafflow_ti.stages.estimators.fns import FNS
+from leafflow_ti.stages.estimators.for3 import FOR3
+from leafflow_ti.stages.estimators.moves import Estimator, Move
+from leafflow_ti.stages.estimators.ols import OLS
+from leafflow_ti.stages.estimators.robust import ROBUST_OLS, ROBUST_OLS_SOR, ROBUST_TLS
+from leafflow_ti.stages.estimators.sampson import SAMPSON
+from leafflow_ti.stages.estimators.tls import TLS, TLS_EQUILIBRATED
 
-from leafflow_ti.stages.estimators.ols import ols
-from leafflow_ti.stages.estimators.tls import tls, tls_equilibrated
-
-Stages = list[tuple[Any, bool]]
-ESTIMATORS: dict[str, Callable[[str], Stages]] = {
-    "ols": ols,
-    "tls": tls,
-    "tls-equilibrated": tls_equilibrated,
+__all__ = ["ESTIMATORS", "Estimator", "Move"]
+ESTIMATORS: dict[str, Estimator] = {
+    "ols": OLS,
+    "tls": TLS,
+    "tls-equilibrated": TLS_EQUILIBRATED,
+    "sampson": SAMPSON,
+    "fns": FNS,
+    "for3": FOR3,
+    "robust-ols": ROBUST_OLS,
+    "robust-ols-sor": ROBUST_OLS_SOR,
+    "robust-tls": ROBUST_TLS,
 }

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from leafflow_ti.stages.estimators.moves import Estimator, Move, Stage, finished
 
 
-def ols(solver: str) -> list[tuple[Any, bool]]:
-    """``J_ff p = -J_f,time`` for every solution, by one Cholesky factor."""
-    from leafflow_ti.kernels.stages import Stage
+def least_squares(which: int = 0) -> list[Move]:
+    """``J_ff p = -J_f,time`` for every solution, by one Cholesky factor; ``which`` = 1: without columns that have an
+    offset."""
+    stages = (Stage.SCALE, Stage.FACTORISE, Stage.LEAST_SQUARES, Stage.ACCEPT, Stage.PARAMETERS)
+    return [Move(stage, which) for stage in stages]
 
-    stages = (
-        Stage.LOAD, Stage.SCALE, Stage.FACTORISE, Stage.LEAST_SQUARES, Stage.ACCEPT, Stage.PARAMETERS,
-        Stage.RESIDUALS, Stage.CENTRE,
-    )  # fmt: skip
-    return [(stage, False) for stage in stages]
+
+def _moves(solver: str) -> list[Move]:
+    return [Move(Stage.LOAD), *least_squares(), *finished(factored=True)]
+
+
+OLS = Estimator(_moves, denoise=0.0)
