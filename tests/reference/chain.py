@@ -4,7 +4,7 @@ the kernels.
 Only the tables (columns, filters, noise factors) come from the library.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import correlate1d, minimum_filter
@@ -140,25 +140,55 @@ def solution_noise(J, columns: ColumnSet, sampling: Sampling, solution):
     return T @ (R @ J[:n, :n] @ R.T * noise_ratio(sampling, columns, solution)[0]) @ T.T
 
 
-def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, denoise=0.9):
-    """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions.
+@dataclass(frozen=True)
+class Solved:
+    """A solution and what its covariances follow from.
 
-    ``denoise``: the share of the noise of its own columns, at the variance of the quietest solution, that J_ff loses.
+    ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
+    the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
     """
-    n, k = columns.n_flow, columns.n_time_like
-    noise = np.diag(column_noise(sampling, columns)[:n])
-    inverse = np.linalg.inv(J[:n, :n] - denoise * np.min(variances) * noise)
-    cov = np.zeros((k, k, n, n))
-    for i, one in enumerate(columns.solutions):
-        for j, two in enumerate(columns.solutions):
-            M = np.zeros((n, n))
-            if i == j:
-                M = solution_noise(J, columns, sampling, one)
-            else:
-                for term in cross_noise(sampling, columns, one, two):
-                    M[term.a, term.b] = J[term.base_a, term.base_b] * term.value
-            cov[i, j] = rho * np.sqrt(variances[i] * variances[j]) * inverse @ M @ inverse
-    return cov
+
+    J: np.ndarray
+    P: np.ndarray
+    variance: np.ndarray
+    noise: np.ndarray
+    rho: float
+
+    @classmethod
+    def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator):
+        """By one of the estimators without weights."""
+        return cls(J, *solve(J, columns, sampling, estimator), np.diag(column_noise(sampling, columns)), rho)
+
+    def clean(self, denoise):
+        """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""
+        n = len(self.P)
+        return self.J[:n, :n] - denoise * np.min(self.variance) * self.noise[:n, :n]
+
+    def covariances(self, columns: ColumnSet, sampling: Sampling, denoise):
+        """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions."""
+        n, k = columns.n_flow, columns.n_time_like
+        inverse = np.linalg.inv(self.clean(denoise))
+        cov = np.zeros((k, k, n, n))
+        for i, one in enumerate(columns.solutions):
+            for j, two in enumerate(columns.solutions):
+                M = np.zeros((n, n))
+                if i == j:
+                    M = solution_noise(self.J, columns, sampling, one)
+                else:
+                    for term in cross_noise(sampling, columns, one, two):
+                        M[term.a, term.b] = self.J[term.base_a, term.base_b] * term.value
+                cov[i, j] = self.rho * np.sqrt(self.variance[i] * self.variance[j]) * inverse @ M @ inverse
+        return cov
+
+    def at_centre(self, columns: ColumnSet, sampling: Sampling, denoise):
+        """Parameters and covariances of monomials, see ``at_centre``."""
+        return at_centre(self.P, self.covariances(columns, sampling, denoise), columns)
+
+
+def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, denoise=0.9):
+    """The same for a tensor and the variances [k] of its residuals."""
+    solved = Solved(J, np.empty((columns.n_flow, 0)), variances, np.diag(column_noise(sampling, columns)), rho)
+    return solved.covariances(columns, sampling, denoise)
 
 
 def solve(J, columns: ColumnSet, sampling: Sampling, estimator):

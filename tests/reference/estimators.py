@@ -19,6 +19,11 @@ from scipy.linalg import eigh
 
 from leafflow_ti.models import ColumnSet
 from leafflow_ti.sampling import Sampling, column_noise, noise_gain
+from leafflow_ti.stages import estimate_tables as tables
+from leafflow_ti.stages.estimators import fns as fns_stages
+from leafflow_ti.stages.estimators import for3 as for3_stages
+from leafflow_ti.stages.estimators import robust as robust_stages
+from leafflow_ti.stages.estimators import sampson as sampson_stages
 
 Array = np.ndarray
 
@@ -100,15 +105,29 @@ def block_weights(axis):
 
 @dataclass(frozen=True)
 class Found:
-    """What an estimator found: parameters [n_flow, k], the weighted tensor and its noise [N, N], ``weights`` [cells].
+    """What an estimator found: parameters [n_flow, k], and the ``weights`` [cells] of its last sums.
 
-    ``M`` and ``N`` are scaled so that the weighted mean of the weights is 1, and those that ``P`` was solved from.
+    M and N [N, N] are these sums, scaled so that the weighted mean of the weights is 1. ``spread``: the variance of the
+    noise of the normal equations, relative to what it is where all cells weigh the same.
     """
 
     P: Array
     M: Array
     N: Array
     weights: Array
+    spread: float
+
+    @classmethod
+    def of(cls, cells, P, weights, S):
+        """``S`` [cells]: the relative noise of the cells when they were weighed."""
+        scaled = normalised(cells, weights) * weights * cells.w
+        return cls(P, *weighted(cells, weights), weights, float(scaled**2 @ S / np.sum(cells.w**2)))
+
+    def solved(self, rho):
+        """What covariances follow from; ``rho`` is the smoothness of the texture."""
+        p = full(self.P)
+        variance = np.einsum("ik,ij,jk->k", p, self.M, p) / np.einsum("ik,ij,jk->k", p, self.N, p)
+        return chain.Solved(self.M, self.P, variance, self.N, rho * self.spread)
 
 
 def full(P):
@@ -162,49 +181,49 @@ def generalised(M, N, k):
 
 def plain(cells: Cells, estimator, scale=1.0):
     """The estimators without weights: ols, tls, tls-equilibrated."""
-    J, ones = cells.tensor, np.ones_like(cells.w)
-    k = cells.columns.n_time_like
+    J, k, ones = cells.tensor, cells.columns.n_time_like, np.ones_like(cells.w)
     if estimator == "ols":
         P = chain.solutions_ols(J, cells.columns)
     else:
         P = null_space(J, cells.noise**-0.5 if estimator == "tls-equilibrated" else cells.degree_scales(scale), k)
-    return Found(P, *weighted(cells, ones), ones)
+    return Found(P, J, np.diag(cells.noise), ones, 1.0)
+
+
+def reweighted(cells: Cells, iterations, solve):
+    """Rounds of ``P = solve(P, M, N)`` with the weights 1 / S_b from the equilibrated total least squares on."""
+    P = plain(cells, "tls-equilibrated").P
+    for _ in range(iterations):
+        S = relative_noise(cells, P)
+        P = solve(P, *weighted(cells, 1 / S))
+    return Found.of(cells, P, 1 / S, S)
 
 
 def sampson(cells: Cells, iterations, scale=1.0):
-    """Sampson's scheme: the residual of every cell over its noise, the weights those of the last round (2.25)."""
-    P, D, k = plain(cells, "tls-equilibrated").P, cells.degree_scales(scale), cells.columns.n_time_like
-    for _ in range(iterations):
-        weights = 1 / relative_noise(cells, P)
-        M, N = weighted(cells, weights)
-        P = null_space(M, D, k)
-    return Found(P, M, N, weights)
+    """Sampson's scheme: the residual of every cell over its noise (2.25)."""
+    D, k = cells.degree_scales(scale), cells.columns.n_time_like
+    return reweighted(cells, iterations, lambda _, M, N: null_space(M, D, k))
 
 
 def fns(cells: Cells, iterations, scale=1.0):
-    """Fundamental numerical scheme: where ``X p`` vanishes ``Σ w_b R_b / S_b`` is stationary."""
-    P, D, k = plain(cells, "tls-equilibrated").P, cells.degree_scales(scale), cells.columns.n_time_like
-    for _ in range(iterations):
-        weights = 1 / relative_noise(cells, P)
-        M, N = weighted(cells, weights)
-        P = null_space(fundamental(cells, P, weights), D, k, nearest_zero=True)
-    return Found(P, M, N, weights)
+    """Fundamental numerical scheme: where ``X p`` vanishes ``Σ w_b R_b / S_b`` is stationary. Sums are those of the
+    last solution."""
+    D, k = cells.degree_scales(scale), cells.columns.n_time_like
+    P = reweighted(cells, iterations, lambda P, *_: null_space(fundamental(cells, P), D, k, nearest_zero=True)).P
+    S = relative_noise(cells, P)
+    return Found.of(cells, P, 1 / S, S)
 
 
-def fundamental(cells: Cells, P, weights):
-    """X [N, N], by which ``X p`` is the gradient of ``Σ w_b R_b / S_b`` where ``weights`` are 1 / S_b."""
+def fundamental(cells: Cells, P):
+    """X [N, N], by which ``X p`` is the gradient of ``Σ w_b R_b / S_b``, scaled as M."""
+    weights = 1 / relative_noise(cells, P)
     pull = weights**2 * residuals(cells, P) * cells.w
     return weighted(cells, weights)[0] - normalised(cells, weights) * np.tensordot(pull, cells.C, 1)
 
 
 def for3(cells: Cells, iterations):
     """First order renormalisation III: ``M v = λ N v`` with both sums weighted; needs no scale."""
-    P, k = plain(cells, "tls-equilibrated").P, cells.columns.n_time_like
-    for _ in range(iterations):
-        weights = 1 / relative_noise(cells, P)
-        M, N = weighted(cells, weights)
-        P = generalised(M, N, k)
-    return Found(P, M, N, weights)
+    k = cells.columns.n_time_like
+    return reweighted(cells, iterations, lambda _, M, N: generalised(M, N, k))
 
 
 PENALTIES: dict[str, tuple[Callable, Callable]] = {
@@ -219,34 +238,51 @@ PENALTIES: dict[str, tuple[Callable, Callable]] = {
 class Schedule:
     """How the scale σ of the penalty falls, and what is estimated meanwhile.
 
-    σ² is ``start`` times the mean residual of the plain fit, times ``shrink`` after every round, at least ``limit``²
-    times the floor: the larger one of the variance ``noise`` and that of a misplacement by ``floor_px``. The first
-    ``translation`` rounds have the columns of no offset alone, then there are ``affine`` rounds of all columns.
+    σ² is ``start`` times the mean residual, times ``shrink`` after every round, at least ``least`` times the floor: the
+    larger one of the variance ``noise`` and that of a misplacement by ``floor_px``. In the first ``translation`` rounds
+    the columns without offset are estimated alone, from their fit without weights on; in ``affine`` rounds all columns.
     """
 
     start: float
     shrink: float
-    limit: float
+    least: float
     floor_px: float
     translation: int
     affine: int
     noise: float = 0.0
 
     def floor(self, cells: Cells):
-        """Residual variance below which nothing is an outlier."""
+        """Residual variance that is no sign of a failure."""
         columns = cells.columns
-        energy = sum(cells.tensor[i, i] for i in (columns.index("x"), columns.index("y"))) / cells.w.sum()
-        return max(self.noise, self.floor_px**2 * energy / cells.noise[-1])
+        energy = np.mean([cells.tensor[i, i] for i in (columns.index("x"), columns.index("y"))]) / cells.w.sum()
+        return max(self.noise, self.floor_px**2 * energy / np.mean(cells.noise[-columns.n_time_like :]))
 
-    def rounds(self, cells: Cells, residual):
-        """σ² and the columns of every round; ``residual`` [cells] of the plain fit."""
-        square = self.start * (cells.w @ residual) / cells.w.sum()
-        least = self.limit**2 * self.floor(cells)
-        columns, n = cells.columns, cells.columns.n
-        still = [i for i, c in enumerate(columns.columns) if c.offset == "1"]
-        for number in range(self.translation + self.affine):
-            yield max(square, least), still if number < self.translation else list(range(n))
-            square *= self.shrink
+
+def mean_residual(cells: Cells, R):
+    """Residual variance of the window from those of its cells."""
+    return (cells.w @ R) / cells.w.sum()
+
+
+def graduated(cells: Cells, P, measures, psi, solve, schedule: Schedule):
+    """Rounds of ``solve(M, N, mean weight, columns, P)`` with weights ``ψ(R / S / σ²) / S``.
+
+    ``P``: where there is no translation round, the start. ``measures``: R and S of every cell by the parameters.
+    """
+    columns = cells.columns
+    still = [i for i, c in enumerate(columns.columns) if c.offset == "1"]
+    if schedule.translation:
+        P = expanded(solve(cells.tensor, np.diag(cells.noise), 1.0, still, P), still, columns)
+    least = schedule.least * schedule.floor(cells)
+    square = max(schedule.start * mean_residual(cells, measures(P)[0]), least)
+    for number in range(schedule.translation + schedule.affine):
+        active = still if number < schedule.translation else list(range(columns.n))
+        R, S = measures(P)
+        weights = psi(R / S / square) / S
+        P = expanded(
+            solve(*weighted(cells, weights), 1 / normalised(cells, weights), active, P), active, columns
+        )  # fmt: skip
+        square = max(schedule.shrink * square, least)
+    return Found.of(cells, P, weights, S)
 
 
 def expanded(P, active, columns: ColumnSet):
@@ -256,40 +292,87 @@ def expanded(P, active, columns: ColumnSet):
     return out
 
 
+def least_squares(M, N, share, active, P):
+    """Parameters of the ``active`` columns: ``M_ff p = -M_f,time``."""
+    k = P.shape[1]
+    A = M[np.ix_(active, active)]
+    return -np.linalg.solve(A[:-k, :-k], A[:-k, -k:])
+
+
+def plain_measures(cells: Cells):
+    """R and S of cells where the noise is all in the time-like columns."""
+    c, ones = cells.noise[-cells.columns.n_time_like :], np.ones_like(cells.w)
+    return lambda P: (residuals(cells, P, c), ones)
+
+
 def robust_ols(cells: Cells, penalty, schedule: Schedule):
     """Iteratively reweighted least squares; the noise is all in the time-like columns (2.35)."""
-    psi, k = PENALTIES[penalty][0], cells.columns.n_time_like
-    P, c = plain(cells, "ols").P, cells.noise[-k:]
-    for square, active in schedule.rounds(cells, residuals(cells, P, c)):
-        weights = psi(residuals(cells, P, c) / square)
-        M, N = weighted(cells, weights)
-        A = M[np.ix_(active, active)]
-        P = expanded(-np.linalg.solve(A[:-k, :-k], A[:-k, -k:]), active, cells.columns)
-    return Found(P, M, N, weights)
+    start = plain(cells, "ols").P
+    return graduated(cells, start, plain_measures(cells), PENALTIES[penalty][0], least_squares, schedule)
 
 
-def robust_ols_sor(cells: Cells, penalty, schedule: Schedule, factor):
-    """The same minimum by successive over-relaxation: one sweep a round, J_ii being the bound of the curvature."""
-    psi, k = PENALTIES[penalty][0], cells.columns.n_time_like
-    P, c, bound = plain(cells, "ols").P, cells.noise[-k:], np.diag(cells.tensor)
-    for square, active in schedule.rounds(cells, residuals(cells, P, c)):
-        weights = psi(residuals(cells, P, c) / square)
-        M, N = weighted(cells, weights)
-        gradient = M / normalised(cells, weights)
-        P = expanded(P[active[:-k]], active, cells.columns)
-        for i in active[:-k]:
-            P[i] -= factor * (gradient[i] @ full(P)) / bound[i]
-    return Found(P, M, N, weights)
+def robust_ols_sor(cells: Cells, penalty, schedule: Schedule, factor, sweeps=1):
+    """The same minimum by sweeps of successive over-relaxation, J_ii being the bound of the curvature.
+
+    Derivatives start at 0, the translation at its solution.
+    """
+    bound = np.diag(cells.tensor)
+
+    def relax(M, N, share, active, P):
+        if len(active) < cells.columns.n:
+            return least_squares(M, N, share, active, P)
+        P = P.copy()
+        for _ in range(sweeps):
+            for i in range(len(P)):
+                P[i] -= factor * share * (M[i] @ full(P)) / bound[i]
+        return P
+
+    start = plain(cells, "ols").P
+    return graduated(cells, start, plain_measures(cells), PENALTIES[penalty][0], relax, schedule)
 
 
 def robust_tls(cells: Cells, penalty, schedule: Schedule):
     """Weights for what is far off, and for the noise of every cell; solved as renormalisation III (2.42)."""
-    psi, k = PENALTIES[penalty][0], cells.columns.n_time_like
-    P = plain(cells, "tls-equilibrated").P
-    for square, active in schedule.rounds(cells, residuals(cells, P)):
-        S = relative_noise(cells, P)
-        weights = psi(residuals(cells, P) / S / square) / S
-        M, N = weighted(cells, weights)
+
+    def measures(P):
+        return residuals(cells, P), relative_noise(cells, P)
+
+    def solve(M, N, share, active, P):
         some = np.ix_(active, active)
-        P = expanded(generalised(M[some], N[some], k), active, cells.columns)
-    return Found(P, M, N, weights)
+        return generalised(M[some], N[some], P.shape[1])
+
+    start = plain(cells, "tls-equilibrated").P
+    return graduated(cells, start, measures, PENALTIES[penalty][0], solve, schedule)
+
+
+ROBUST = {"robust-ols": "ols", "robust-ols-sor": "ols", "robust-tls": "tls-equilibrated"}
+"""Robust estimators, and the plain ones that must have failed where they are wanted."""
+
+
+def failed(cells: Cells, estimator, schedule: Schedule, factor):
+    """Whether the residual of the plain fit is above ``factor`` times its floor."""
+    plain_fit = ROBUST[estimator]
+    P = plain(cells, plain_fit).P
+    R = plain_measures(cells)(P)[0] if plain_fit == "ols" else residuals(cells, P)
+    return mean_residual(cells, R) > factor * schedule.floor(cells)
+
+
+def estimate(cells: Cells, problem):
+    """What the library's ``problem`` asks for, with the library's tunables."""
+    name = problem.estimator
+    rounds = {"sampson": sampson_stages.ROUNDS, "fns": fns_stages.ROUNDS, "for3": for3_stages.ROUNDS}
+    if name in ("sampson", "fns"):
+        return {"sampson": sampson, "fns": fns}[name](cells, rounds[name], problem.scale)
+    if name == "for3":
+        return for3(cells, rounds[name])
+    if name not in ROBUST:
+        return plain(cells, name, problem.scale)
+    schedule = Schedule(
+        tables.SCALE_START, tables.SCALE_SHRINK, tables.SCALE_LEAST, tables.FLOOR_PX,
+        robust_stages.TRANSLATION_ROUNDS, robust_stages.ROUNDS, problem.noise**2,
+    )  # fmt: skip
+    if problem.robust == "failed" and not failed(cells, name, schedule, tables.FAILED):
+        return plain(cells, ROBUST[name])
+    if name == "robust-ols-sor":
+        return robust_ols_sor(cells, problem.penalty, schedule, tables.RELAXATION, robust_stages.SWEEPS)
+    return {"robust-ols": robust_ols, "robust-tls": robust_tls}[name](cells, problem.penalty, schedule)
