@@ -44,6 +44,8 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                     element[i] = ti.cast(J[begin + i], precise)
             ws[moments + k * p.stride] = element
         ws[region(p, number, Region.CONVERGED)] = V(0.0)
+        if number[p.n + Number.REWEIGHTED] == 1:
+            ws[region(p, number, Region.ACTIVE)] = V(1.0)
 
     @ti.func
     def left_out(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
@@ -329,7 +331,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
         p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
         out: ti.template(),
     ):  # fmt: skip
-        """``A := L^-1 A L^-T`` with ``L L^T = S N S``, for ``A v = λ N v`` as an eigenproblem; ``which``: see ``scale``."""
+        """``A := L^-1 A L^-T``, ``L L^T = S N S``: ``A v = λ N v`` as an eigenproblem; ``which`` as in ``scale``."""
         n = number[p.n + Number.N]
         packed, factor = region(p, number, Region.TENSOR), region(p, number, Region.NOISE_FACTOR)
         noise, full = region(p, number, Region.WEIGHT_NOISE), region(p, number, Region.FULL)
