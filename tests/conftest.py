@@ -242,7 +242,7 @@ class Bench:
         def solve(J: Any, rho: float, sampling: Sampling, columns: ColumnSet) -> chain.Solved:
             if weighed:
                 return weighted.estimate(J, problem).solved(rho)
-            return chain.Solved.of(J, rho, columns, sampling, problem.estimator)
+            return chain.Solved.of(J, rho, columns, sampling, problem.estimator, problem.scale)
 
         weighed = ESTIMATORS[problem.estimator].weighs
         own = self.own_reference(row, col, weighed) if problem.own_flows else []

@@ -117,13 +117,20 @@ def solutions_ols(J, columns: ColumnSet):
     return -np.linalg.solve(J[:n, :n], J[:n, n:])
 
 
-def solutions_tls(J, columns: ColumnSet, noise=None):
-    """P [n_flow, k] from the k smallest eigenvectors, combined so that one time-like differential is 1 (3.3.2)."""
-    s = np.ones(columns.n) if noise is None else noise**-0.5
-    _, vectors = np.linalg.eigh(J * np.outer(s, s))
-    v = vectors[:, : columns.n_time_like] * s[:, None]
+def solutions_tls(J, columns: ColumnSet, scales):
+    """P [n_flow, k] from the k smallest eigenvectors, combined so that one time-like differential is 1 (3.3.2).
+
+    ``scales`` [N]: what the columns are multiplied by.
+    """
+    _, vectors = np.linalg.eigh(J * np.outer(scales, scales))
+    v = vectors[:, : columns.n_time_like] * scales[:, None]
     n = columns.n_flow
     return v[:n] @ np.linalg.inv(v[n:])
+
+
+def coordinate_scales(columns: ColumnSet, scale):
+    """Factors [N] of columns in raw units where those of the image coordinates are ``1 / scale`` px."""
+    return np.array([float(scale) ** sum(c.terms[0].exponents[:2]) for c in columns.columns])
 
 
 def noise_variance(J, P, columns: ColumnSet, noise):
@@ -155,9 +162,9 @@ class Solved:
     rho: float
 
     @classmethod
-    def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator):
-        """By one of the estimators without weights."""
-        return cls(J, *solve(J, columns, sampling, estimator), np.diag(column_noise(sampling, columns)), rho)
+    def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
+        """By one of the estimators without weights, see ``solve``."""
+        return cls(J, *solve(J, columns, sampling, estimator, scale), np.diag(column_noise(sampling, columns)), rho)
 
     def clean(self, denoise):
         """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""
@@ -191,11 +198,15 @@ def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, d
     return solved.covariances(columns, sampling, denoise)
 
 
-def solve(J, columns: ColumnSet, sampling: Sampling, estimator):
-    """Parameters P [n_flow, k] of one of the estimators, and the noise variance [k] of their residuals."""
+def solve(J, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
+    """Parameters P [n_flow, k] of one of the estimators, and the noise variance [k] of their residuals.
+
+    ``scale``: see ``coordinate_scales``; of raw total least squares.
+    """
     noise = column_noise(sampling, columns)
     if estimator == "ols":
         P = solutions_ols(J, columns)
     else:
-        P = solutions_tls(J, columns, noise if estimator == "tls-equilibrated" else None)
+        scales = noise**-0.5 if estimator == "tls-equilibrated" else coordinate_scales(columns, scale)
+        P = solutions_tls(J, columns, scales)
     return P, noise_variance(J, P, columns, noise)

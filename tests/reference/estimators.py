@@ -59,10 +59,6 @@ class Cells:
         """J [N, N] of the window."""
         return self.J.sum(axis=0)
 
-    def degree_scales(self, scale):
-        """D [N]: what columns are multiplied by where the unit of the image coordinates is ``1 / scale`` px."""
-        return np.array([scale ** sum(c.terms[0].exponents[:2]) for c in self.columns.columns], dtype=float)
-
 
 def noise_vectors(sampling: Sampling, columns: ColumnSet):
     """g [N, t, sy, sx, y, x] of every channel of every data vector: the noise covariance (2.24) of d is Σ g g^T."""
@@ -167,11 +163,10 @@ def parameters(vectors, k):
     return vectors[:-k] @ np.linalg.inv(vectors[-k:])
 
 
-def null_space(X, scale, k, nearest_zero=False):
-    """P from the k smallest eigenvalues of ``D X D``, by value or by magnitude; ``scale`` [N] is the diagonal of D."""
-    values, vectors = np.linalg.eigh(X * np.outer(scale, scale))
-    order = np.argsort(np.abs(values) if nearest_zero else values)
-    return parameters(scale[:, None] * vectors[:, order[:k]], k)
+def nearest_zero(X, scales, k):
+    """P from the k eigenvalues of ``D X D`` that are nearest to 0; ``scales`` [N] is the diagonal of D."""
+    values, vectors = np.linalg.eigh(X * np.outer(scales, scales))
+    return parameters(scales[:, None] * vectors[:, np.argsort(np.abs(values))[:k]], k)
 
 
 def generalised(M, N, k):
@@ -181,12 +176,13 @@ def generalised(M, N, k):
 
 def plain(cells: Cells, estimator, scale=1.0):
     """The estimators without weights: ols, tls, tls-equilibrated."""
-    J, k, ones = cells.tensor, cells.columns.n_time_like, np.ones_like(cells.w)
+    J, columns = cells.tensor, cells.columns
     if estimator == "ols":
-        P = chain.solutions_ols(J, cells.columns)
+        P = chain.solutions_ols(J, columns)
     else:
-        P = null_space(J, cells.noise**-0.5 if estimator == "tls-equilibrated" else cells.degree_scales(scale), k)
-    return Found(P, J, np.diag(cells.noise), ones, 1.0)
+        raw = chain.coordinate_scales(columns, scale)
+        P = chain.solutions_tls(J, columns, cells.noise**-0.5 if estimator == "tls-equilibrated" else raw)
+    return Found(P, J, np.diag(cells.noise), np.ones_like(cells.w), 1.0)
 
 
 def reweighted(cells: Cells, iterations, solve):
@@ -200,15 +196,15 @@ def reweighted(cells: Cells, iterations, solve):
 
 def sampson(cells: Cells, iterations, scale=1.0):
     """Sampson's scheme: the residual of every cell over its noise (2.25)."""
-    D, k = cells.degree_scales(scale), cells.columns.n_time_like
-    return reweighted(cells, iterations, lambda _, M, N: null_space(M, D, k))
+    D = chain.coordinate_scales(cells.columns, scale)
+    return reweighted(cells, iterations, lambda _, M, N: chain.solutions_tls(M, cells.columns, D))
 
 
 def fns(cells: Cells, iterations, scale=1.0):
     """Fundamental numerical scheme: where ``X p`` vanishes ``Σ w_b R_b / S_b`` is stationary. Sums are those of the
     last solution."""
-    D, k = cells.degree_scales(scale), cells.columns.n_time_like
-    P = reweighted(cells, iterations, lambda P, *_: null_space(fundamental(cells, P), D, k, nearest_zero=True)).P
+    D, k = chain.coordinate_scales(cells.columns, scale), cells.columns.n_time_like
+    P = reweighted(cells, iterations, lambda P, *_: nearest_zero(fundamental(cells, P), D, k)).P
     S = relative_noise(cells, P)
     return Found.of(cells, P, 1 / S, S)
 
