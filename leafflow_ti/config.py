@@ -19,6 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from leafflow_ti.config_values import auto_or_integer, integer, machine_memory, numbers, parse_memory
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
+from leafflow_ti.filters import MAX_BLUR
 from leafflow_ti.presets import (
     PRESETS,
     REFINED_MODEL,
@@ -134,6 +135,9 @@ class WindowSection(_Section):
 class FiltersSection(_Section):
     """Derivative filters per axis; "auto" takes the largest set up to ``taps`` that the number of samples allows.
 
+    ``blur``: the filters along x and y are convolved with a Gaussian of so many pixels. Texture that moves by more than
+    half its wavelength per frame is aliased along time; with 1 px, 5 px/frame are measured that 7 taps alone miss.
+
     ``prefilter`` of every image, with a Gaussian of ``sigma_pre`` pixels. On the cube under a spotlight, 8 are the best
     of 2 to 32: below, texture is lost; above, the light is left, and the dark beside the cube comes in.
     """
@@ -141,6 +145,7 @@ class FiltersSection(_Section):
     taps: _Taps = "5"
     taps_time: _AutoTaps = "auto"
     taps_camera: _AutoTaps = "auto"
+    blur: Annotated[float, Field(ge=0, le=MAX_BLUR, allow_inf_nan=False)] = 0.0
     prefilter: Prefilter = "none"
     sigma_pre: _Width = 8.0
 

@@ -24,6 +24,11 @@ _TABLE: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 FILTER_SETS = tuple(_TABLE)
 
+BLUR_CUT = 3
+"""Sigmas at which the Gaussian of ``FilterSet.blurred`` is cut off."""
+MAX_BLUR = 4.0
+"""Widest such Gaussian [samples]: beyond, the filters would be longer than the windows they serve."""
+
 
 @dataclass(frozen=True)
 class FilterSet:
@@ -41,6 +46,14 @@ class FilterSet:
     def kernel(self, differentiate: bool) -> Array:
         """The derivative or the smoothing kernel, shape (2 radius + 1,)."""
         return np.array(self.derivative if differentiate else self.smooth)
+
+    def blurred(self, sigma: float) -> FilterSet:
+        """The set of a signal that a Gaussian of ``sigma`` samples has smoothed; itself for 0."""
+        if sigma == 0.0:
+            return self
+        gaussian = gaussian_weights(2 * math.ceil(BLUR_CUT * sigma) + 1, sigma)
+        derivative, smooth = (np.convolve(self.kernel(d), gaussian) for d in (True, False))
+        return FilterSet(f"{self.name}, blur {sigma:g}", tuple(derivative.tolist()), tuple(smooth.tolist()))
 
 
 def filter_set(name: str) -> FilterSet:

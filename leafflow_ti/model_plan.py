@@ -132,7 +132,8 @@ def sampling_of(capture: Capture, config: RunConfig, cameras: str, time: bool) -
     w = config.window
     camera = ("cameras", config.filters.taps_camera, w.size_camera, w.sigma_camera, config.filters.taps)
     frames = ("frames", config.filters.taps_time, w.size_time, w.sigma_time, config.filters.taps)
-    pixel = AxisSampling.gaussian(filter_set(config.filters.taps), w.size, w.sigma, int(w.stride))
+    filters = filter_set(config.filters.taps).blurred(config.filters.blur)
+    pixel = AxisSampling.gaussian(filters, w.size, w.sigma, int(w.stride))
     return Sampling(
         pixel,
         pixel,

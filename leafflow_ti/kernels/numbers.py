@@ -36,6 +36,8 @@ class Stage(IntEnum):
 
 AGAIN = 8
 """Added to ``Weights``: σ of the penalty begins anew, the pixels have been chosen."""
+NARROW = 16
+"""Added to ``Weights``: cells near the middle of the window count most."""
 
 
 class Penalty(IntEnum):

@@ -163,8 +163,29 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
                 ws[factor_at + tri(r, c) * p.stride] = spread
 
     @ti.func
+    def contradicts(n_rows: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """Mean squared difference of the rows from what the present motion gives, by their own errors.
+
+        Where two surfaces meet, a robust estimate may have chosen the other one in this camera.
+        """
+        n, total = number[p.n + Number.UNKNOWNS], V(0.0)
+        for r in range(n_rows):
+            rest = ws[region(p, number, Region.VALUE) + r * p.stride]
+            for j in range(MAX_UNKNOWNS):
+                place = number[p.n + Number.PLACE + j]
+                if place >= 0:
+                    element = ws[region(p, number, Region.DESIGN) + (r * n + place) * p.stride]
+                    rest = rest - element * ws[region(p, number, Region.MOTION) + j * p.stride]
+            spread = ws[region(p, number, Region.FACTOR) + tri(r, r) * p.stride]
+            total = total + rest * rest / ti.max(spread, V(1e-30))
+        return total * (precise(1.0) / ti.cast(n_rows, precise))
+
+    @ti.func
     def leave_out(n_rows: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
-        """Rows of an own flow whose window has left the image or that follows nothing get zero values and design."""
+        """Rows of an own flow whose window has left the image or that follows nothing get zero values and design.
+
+        So do those of a robust estimate that contradict the motion of the reference's rows.
+        """
         n, parameters = number[p.n + Number.UNKNOWNS], region(p, number, Region.PARAMETERS)
         mass = ws[region(p, number, Region.MOMENTS) + number[p.n + Number.EXTRA] * p.stride]
         shift = V(0.0)
@@ -173,6 +194,9 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
             shift = shift + u * u
         limit = value[p.v + Value.MAX_SHIFT]
         used = (shift < V(limit * limit)) & (mass > V(value[p.v + Value.MIN_MASS]))
+        if number[p.n + Number.ROBUST] == 1:
+            other = contradicts(n_rows, p, number, value, ws) > V(value[p.v + Value.MAX_CONTRADICTION])
+            used = used & (not (other & (ws[region(p, number, Region.ACTIVE)] > V(0.5))))
         for r in range(n_rows):
             for c in range(r + 1):
                 # Also where the covariance is no number: a unit matrix in its place.

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
-from leafflow_ti.kernels.numbers import AGAIN, Penalty, Weights
+from leafflow_ti.kernels.numbers import AGAIN, NARROW, Penalty, Weights
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.workspace import Number, Region, Value
 
@@ -97,11 +97,14 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         gain = precise(0.0)
         for j in range(k):
             gain += value[p.v + Value.NOISE + n - k + j] / ti.cast(k, precise)
-        floor = ti.max(energy * (0.5 * value[p.v + Value.FLOOR] / gain), V(value[p.v + Value.NOISE_LEVEL]))
+        energy = energy * (precise(0.5) / gain)
+        level = value[p.v + Value.NOISE_LEVEL]
         least = region(p, number, Region.LEAST_SQUARED)
         if p.which < AGAIN:
-            ws[least] = ti.max(floor * value[p.v + Value.SCALE_LEAST], V(1e-30))
-            failed = residual > floor * value[p.v + Value.FAILED]
+            lowest = energy * value[p.v + Value.LEAST_DISPLACED] + level * value[p.v + Value.LEAST_NOISE]
+            ws[least] = ti.max(lowest, V(1e-30))
+            most = energy * value[p.v + Value.MOST_DISPLACED] + level * value[p.v + Value.MOST_NOISE]
+            failed = residual > most
             if kind < Weights.PENALTY or number[p.n + Number.EVERYWHERE] == 1:
                 failed = energy > V(0.0)
             ws[region(p, number, Region.ACTIVE)] = ti.select(failed, V(1.0), V(0.0))
@@ -144,7 +147,8 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         out: ti.template(),
     ):  # fmt: skip
         """Weigh the window's cells by the present solution; ``which``: ``Weights``. Then σ² of the penalty shrinks."""
-        plain = ti.cast(p.which == Weights.PENALTY_PLAIN, ti.i32)
+        kind, narrow = p.which % NARROW, p.which // NARROW
+        plain = ti.cast(kind == Weights.PENALTY_PLAIN, ti.i32)
         prepare(plain, p, number, value, ws)
         n_x, n_y = number[p.n + Number.CELLS_X], number[p.n + Number.CELLS_Y]
         terms, monomials = number[p.n + Number.CELL_TERMS], number[p.n + Number.CELL_MONOMIALS]
@@ -153,10 +157,10 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         lists = p.n + number[p.n + Number.CELL_LISTS]
         first_term = lists + entries + 1
         powers_at = first_term + 3 * terms + 3 * noises
-        # Weights, powers of the middles, mean powers; along x, then along y.
+        # Weights, narrow weights, powers of the middles, mean powers; along x, then along y.
         along_x = p.v + number[p.n + Number.CELL_VALUES] + terms + noises
         degrees = number[lists - 1]
-        along_y = along_x + (1 + 2 * degrees) * n_x
+        along_y = along_x + (2 + 2 * degrees) * n_x
         sums, cell = region(p, number, Region.WEIGHT_SUMS), region(p, number, Region.CELL)
         noise_sums = sums + entries * p.stride
         own, relative = region(p, number, Region.CELL_ENTRIES), region(p, number, Region.RELATIVE)
@@ -178,7 +182,7 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
                 noise = V(0.0)
                 for m in range(monomials):
                     x, y = number[powers_at + 2 * m], number[powers_at + 2 * m + 1]
-                    mean = value[along_x + (1 + degrees + x) * n_x + bx] * value[along_y + (1 + degrees + y) * n_y + by]
+                    mean = value[along_x + (2 + degrees + x) * n_x + bx] * value[along_y + (2 + degrees + y) * n_y + by]
                     noise = noise + ws[relative + m * p.stride] * mean
                 if plain == 1:
                     noise = V(1.0)
@@ -186,26 +190,28 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
                     total = V(0.0)
                     for t in range(number[lists + e], number[lists + e + 1]):
                         x, y = number[first_term + 3 * t + 1], number[first_term + 3 * t + 2]
-                        power = value[along_x + (1 + x) * n_x + bx] * value[along_y + (1 + y) * n_y + by]
+                        power = value[along_x + (2 + x) * n_x + bx] * value[along_y + (2 + y) * n_y + by]
                         factor = window * power * value[p.v + number[p.n + Number.CELL_VALUES] + t]
                         total = total + ws[cell + number[first_term + 3 * t] * p.stride] * factor
                     ws[own + e * p.stride] = total
                 some = counted > V(0.0)
                 inverse = 1.0 / ti.max(noise, V(1e-6))
                 weight, second = inverse, V(0.0)
-                if p.which != Weights.NOISE:
+                if kind != Weights.NOISE:
                     residual = small.dot(ws, quadratic, 1, own, 1, entries, p.stride)
                     residual = residual / ti.select(some, counted, V(1.0))
-                    if p.which == Weights.FUNDAMENTAL:
+                    if kind == Weights.FUNDAMENTAL:
                         second = residual * inverse * inverse
                     else:
                         weight = inverse * penalise(residual * inverse / squared, number[p.n + Number.PENALTY])
+                if narrow == 1:
+                    weight = weight * (value[along_x + n_x + bx] * value[along_y + n_y + by])
                 weight = ti.select(some, weight, V(0.0))
                 for e in range(entries):
                     ws[sums + e * p.stride] = ws[sums + e * p.stride] + ws[own + e * p.stride] * weight
                 for m in range(monomials):
                     x, y = number[powers_at + 2 * m], number[powers_at + 2 * m + 1]
-                    mean = value[along_x + (1 + degrees + x) * n_x + bx] * value[along_y + (1 + degrees + y) * n_y + by]
+                    mean = value[along_x + (2 + degrees + x) * n_x + bx] * value[along_y + (2 + degrees + y) * n_y + by]
                     one, two = noise_sums + m * p.stride, noise_sums + (monomials + m) * p.stride
                     ws[one] = ws[one] + weight * counted * mean
                     ws[two] = ws[two] + second * counted * mean

@@ -235,6 +235,7 @@ class Number(IntEnum):
     STEP = auto()
     PITCH = auto()
     REWEIGHTED = auto()  # windows are weighted anew; what begins with CELL or SOURCE means something only then
+    ROBUST = auto()  # rows of own flows that contradict the reference's are left out
     EVERYWHERE = auto()  # in every pixel, else where the plain fit failed
     PENALTY = auto()  # a Penalty
     CELLS_X = auto()  # cells of the window along x, y
@@ -294,10 +295,14 @@ class Value(IntEnum):
     NOISE_LEVEL = auto()  # variance of the images' noise, 0 where it is not known
     SCALE_START = auto()  # σ² of the penalty: first one, per mean squared residual
     SCALE_SHRINK = auto()  # from one round to the next
-    SCALE_LEAST = auto()  # least one, per floor of the residual
-    FLOOR = auto()  # px²: mean squared displacement that models leave out
-    FAILED = auto()  # residual per floor above which the plain fit failed
+    LEAST_NOISE = auto()  # least one: per variance of the noise, and
+    LEAST_DISPLACED = auto()  # per squared gradient, px²
+    MOST_NOISE = auto()  # largest squared residual of a plain fit that did not fail, likewise
+    MOST_DISPLACED = auto()
     RELAXATION = auto()  # factor of a relaxation step
+    MAX_CONTRADICTION = (
+        auto()
+    )  # mean squared difference of an own flow's rows, per variance, from the reference's motion
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9

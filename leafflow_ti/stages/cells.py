@@ -21,6 +21,8 @@ from leafflow_ti.stages.channels import MASS, MapKey, Request
 from leafflow_ti.stages.windows import BlockMap
 
 Array = NDArray[np.float64]
+NARROW = 0.3
+"""Width of a narrow window's further weights, per width of the window."""
 Source = tuple[BlockMap, int]
 """A block sum, and the power of the frames' offsets that it is weighted by over time."""
 _X, _Y, _T = (AXES.index(a) for a in ("x", "y", "t"))
@@ -104,8 +106,8 @@ class Cells:
 
     @property
     def values(self) -> Array:
-        """What the table ``value`` gets: factors of terms and noises; along x, then along y the weights of the cells,
-        powers of their middles, and the mean powers of their samples' offsets."""
+        """What the table ``value`` gets: factors of terms and noises; along x, then along y the weights of the cells
+        and further ones of a narrow window, powers of their middles, and mean powers of their samples' offsets."""
         factors = [[term[3] for entry in self.entries for term in entry], [noise[3] for noise in self.noises]]
         blocks = (self.request.sampling.x.blocked, self.request.sampling.y.blocked)
         return np.concatenate([*factors, *(self._along(b) for b in blocks)])
@@ -114,4 +116,5 @@ class Cells:
         powers = np.arange(self.degrees)[:, None]
         samples = (blocks.centres[:, None] + blocks.inner) ** powers[..., None]
         means = samples @ np.array(blocks.shape) / sum(blocks.shape)
-        return np.concatenate([blocks.weights, (blocks.centres**powers).ravel(), means.ravel()])
+        narrow = np.exp(-0.5 * blocks.centres**2 / (NARROW**2 * blocks.moment))
+        return np.concatenate([blocks.weights, narrow, (blocks.centres**powers).ravel(), means.ravel()])

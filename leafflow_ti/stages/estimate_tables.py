@@ -72,17 +72,19 @@ def _packed(a: int, b: int) -> int:
     return r * (r + 1) // 2 + c
 
 
-SCALE_START = 4.0
+SCALE_START = 1.0
 """Of the penalty's σ², per mean squared residual of the plain fit: everything counts, more or less."""
 SCALE_SHRINK = 0.5
-SCALE_LEAST = 4.0
-"""Least σ² of the penalty per floor of the squared residual: noise, or what models leave out, whichever is larger."""
-FLOOR_PX = 0.02
-"""Displacement that models leave out: residuals below it are no sign of a failure."""
-FAILED = 3.0
-"""Squared residual per floor from which on the plain fit failed."""
+LEAST_NOISE, LEAST_PX = 2.0, 0.007
+"""Least σ² of the penalty: so many variances of the noise, and what models leave out, as a displacement."""
+MOST_NOISE, MOST_PX = 3.0, 0.02
+"""Squared residual above which the plain fit failed, likewise."""
 RELAXATION = 1.5
 """Factor of a step of over-relaxation; converges between 0 and 2."""
+
+MAX_CONTRADICTION = 16.0
+"""Mean squared difference, in error bars, between a camera's own flow and the reference's motion, above which a robust
+estimate is taken to be of another surface."""
 
 
 @dataclass(frozen=True)
@@ -322,7 +324,9 @@ class ProblemTables:
         from leafflow_ti.kernels.workspace import Number, Value
 
         problem = self.problem
-        self._set_numbers(tables.number, REWEIGHTED=len(self._cells) > 0)
+        own = problem.own_flows
+        compared = self._estimator.robust and own is not None and own.reference_rows
+        self._set_numbers(tables.number, REWEIGHTED=len(self._cells) > 0, ROBUST=compared)
         if not self._cells:
             return tables
         cells, planes = self._cells[min(request, 1)], self._sources[request]
@@ -339,10 +343,11 @@ class ProblemTables:
         constant = [max(c.terms[0].exponents) == 0 for c in columns.columns]
         number[Number.CONSTANT : Number.CONSTANT + columns.n] = constant
         value[Value.NOISE_LEVEL] = problem.noise**2
-        value[Value.SCALE_START], value[Value.SCALE_SHRINK], value[Value.SCALE_LEAST] = (
-            SCALE_START, SCALE_SHRINK, SCALE_LEAST
-        )  # fmt: skip
-        value[Value.FLOOR], value[Value.FAILED], value[Value.RELAXATION] = FLOOR_PX**2, FAILED, RELAXATION
+        value[Value.SCALE_START], value[Value.SCALE_SHRINK] = SCALE_START, SCALE_SHRINK
+        value[Value.LEAST_NOISE], value[Value.LEAST_DISPLACED] = LEAST_NOISE, LEAST_PX**2
+        value[Value.MOST_NOISE], value[Value.MOST_DISPLACED] = MOST_NOISE, MOST_PX**2
+        value[Value.RELAXATION] = RELAXATION
+        value[Value.MAX_CONTRADICTION] = MAX_CONTRADICTION
         return Tables(number.astype(np.int32), value)
 
     def _unscaled(self, value: NDArray[np.float64], columns: ColumnSet) -> NDArray[np.float64]:

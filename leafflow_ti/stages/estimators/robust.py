@@ -7,24 +7,30 @@ Only pixels whose plain fit failed are estimated anew, unless all are asked for.
 
 from __future__ import annotations
 
-from leafflow_ti.kernels.numbers import AGAIN
+from leafflow_ti.kernels.numbers import AGAIN, NARROW
 from leafflow_ti.stages.estimators.moves import Estimator, Move, Stage, Weights, finished, null_space, rounds
 from leafflow_ti.stages.estimators.ols import least_squares
 
-TRANSLATION_ROUNDS = 6
-ROUNDS = 8
+TRANSLATION_ROUNDS = 4
+NARROW_ROUNDS = 4
+ROUNDS = 4
 SWEEPS = 8
 """Of over-relaxation, per round of weights."""
 
 
 def _graduated(weights: Weights, start: list[Move], first: list[Move], full: list[Move]) -> list[Move]:
-    """Plain solution ``start``, then rounds for the translation, then for everything."""
-    reweight = Move(Stage.REWEIGHT, weights)
+    """Plain solution ``start``, then rounds for the translation, then for everything.
+
+    At first the middle of the window counts most: where two surfaces meet, the one that the pixel lies on must win,
+    not the one that fills more of the window or has more texture.
+    """
+    near, far = Move(Stage.REWEIGHT, weights + NARROW), Move(Stage.REWEIGHT, weights)
     return [
         Move(Stage.LOAD), *start, Move(Stage.BEGIN_WEIGHTS, weights),
-        *rounds(1, *first, Move(Stage.BEGIN_WEIGHTS, weights + AGAIN)),
-        *rounds(TRANSLATION_ROUNDS, reweight, *first),
-        *rounds(ROUNDS, reweight, *full),
+        *rounds(1, Move(Stage.REWEIGHT, Weights.NOISE + NARROW), *first, Move(Stage.BEGIN_WEIGHTS, weights + AGAIN)),
+        *rounds(TRANSLATION_ROUNDS, near, *first),
+        *rounds(NARROW_ROUNDS, near, *full),
+        *rounds(ROUNDS, far, *full),
         *finished(factored=False),
     ]  # fmt: skip
 
@@ -45,6 +51,6 @@ def _tls(solver: str) -> list[Move]:
     return _graduated(Weights.PENALTY, null_space(solver), first, full)
 
 
-ROBUST_OLS = Estimator(_ols, weighs=True, denoise=0.0)
-ROBUST_OLS_SOR = Estimator(_sor, weighs=True, denoise=0.0)
-ROBUST_TLS = Estimator(_tls, weighs=True)
+ROBUST_OLS = Estimator(_ols, weighs=True, denoise=0.0, robust=True)
+ROBUST_OLS_SOR = Estimator(_sor, weighs=True, denoise=0.0, robust=True)
+ROBUST_TLS = Estimator(_tls, weighs=True, robust=True)
