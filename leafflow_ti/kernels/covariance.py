@@ -35,6 +35,8 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
         quietest = ws[variance]
         for j in range(1, number[p.n + Number.SOLUTIONS]):
             quietest = ti.min(quietest, ws[variance + j * p.stride])
+        # Nothing to take off where nothing was found: what is not a number must not spread.
+        quietest = ti.select(quietest > V(0.0), quietest, V(0.0))
         floor = V(0.0)
         for r in range(flow):
             for c in range(r + 1):
