@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from leafflow_ti.config_values import auto_or_integer, integer, machine_memory, numbers, parse_memory
+from leafflow_ti.config_values import auto_or_integer, integer, machine_memory, noise_or_auto, numbers, parse_memory
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
 from leafflow_ti.presets import (
@@ -57,6 +57,7 @@ _AutoCount = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v,
 _AutoSteps = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 0, high=50))]
 _AutoDegree = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 5, odd=True, high=7))]
 _AutoRefined = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, REFINED_WINDOW, odd=True))]
+_Noise = Annotated[float | _Auto, BeforeValidator(noise_or_auto)]
 _Width = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -70,7 +71,8 @@ class ModelSection(_Section):
     ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its derivatives along x, y) followed by
     any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can. ``deformation`` growth:
     the patch may grow in its plane, one more unknown; auto: where the flows of all cameras, or the refinement, are
-    there to tell. strain: in the refinement it may stretch in its plane, three more unknowns.
+    there to tell. strain: in the refinement it may stretch in its plane, three more unknowns. ``noise``: standard
+    deviation of the images' noise in grey values; auto: estimated from the middle frame of the reference camera.
     """
 
     name: ModelName = "auto"
@@ -82,6 +84,7 @@ class ModelSection(_Section):
     estimator: Estimator = "tls-equilibrated"
     solver: Solver = "fast"
     weighting: Weighting = "wls"
+    noise: _Noise = "auto"
 
     @field_validator("rows")
     @classmethod

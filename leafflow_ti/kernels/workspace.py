@@ -241,7 +241,11 @@ class Value(IntEnum):
     MAX_RESIDUAL = auto()  # px, for status incoherent
     MAX_SHIFT = auto()  # px per step or frame, likewise
     MOTION_SCALE = auto()  # 2: mm per px of range flow's U', V', and of W
-    GAP = MOTION_SCALE + 2  # convergence: residual per gap
+    NOISE_LEVEL = MOTION_SCALE + 2  # variance of the image noise as far as it is known beforehand, else 0
+    LEAST_SHARE = auto()  # share of the gradient's mean energy that is no texture where there is less noise than that
+    UNKNOWN = auto()  # noise over information at which a direction of the parameters is not determined
+    MISFIT = auto()  # px²: square of the misfit that is the model's, for the confidence
+    GAP = auto()  # convergence: residual per gap
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9

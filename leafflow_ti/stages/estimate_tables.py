@@ -50,6 +50,11 @@ MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
 """Least energy of the gradient relative to that of the image, (8 eps)²: below, it is the rounding of a constant."""
 MIN_MASS = 0.2
 """Least share of the window's weight that must lie inside the images (a corner pixel has 1/4)."""
+LEAST_SHARE = 5e-5
+"""Share of the gradient's mean energy in a direction that is no texture, however little noise there is: what filters
+and rounding leave."""
+MISFIT_PX = 0.02
+"""Misfit of the brightness constraint that is usual without noise, as a displacement."""
 MAX_RESIDUAL_PX = 0.5
 """Root mean square misfit of the brightness constraint, as a displacement, above which a window is incoherent."""
 
@@ -132,6 +137,7 @@ class ProblemTables:
         self.raw = len(self.tables)
         if problem.estimator == "tls":
             self.tables += [Tables(t.number.copy(), self._unscaled(t.value)) for t in self.tables]
+        self.set_noise(problem.noise)
 
     def _rows(self) -> SimpleNamespace:
         """Columns of the motion rows and of each camera solution's geometry rows; brightness rows stand last."""
@@ -205,6 +211,10 @@ class ProblemTables:
         value[Value.NOISE : Value.NOISE + columns.n] = noise
         value[Value.GAIN] = noise[flow_rows[0]]
         value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
+        value[Value.LEAST_SHARE] = LEAST_SHARE
+        # Undetermined is what holds no more texture than noise, in J_ff without the share that is taken out.
+        value[Value.UNKNOWN] = 2.0 - DENOISE[problem.estimator]
+        value[Value.MISFIT] = 2 * MISFIT_PX**2
         value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
         for code, name in enumerate(("1", *AXES, "range")):
@@ -274,6 +284,13 @@ class ProblemTables:
                     value[Value.PARTNER + a] = factor * scales[0] / scales[1]
             found.append(Tables(number, value))
         return found
+
+    def set_noise(self, noise: float) -> None:
+        """Enter the noise level of the images [grey values]."""
+        from leafflow_ti.kernels.workspace import Value
+
+        for tables in self.tables:
+            tables.value[Value.NOISE_LEVEL] = noise**2
 
     def aim(self, view: View) -> None:
         """Enter the camera and the output grid."""

@@ -39,7 +39,7 @@ class Problem:
 
     ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``fitted``: unknowns of the motion fit to the
     reference's rows (0: none), from which a fit with ``own_flows`` starts. ``range_scale``: of range flow, mm per px of
-    (U', V') and of W.
+    (U', V') and of W. ``noise``: standard deviation of the images' noise [grey values] as far as it is known.
     """
 
     columns: ColumnSet
@@ -54,6 +54,7 @@ class Problem:
     passes: int = 2
     iterations: int = 4
     range_scale: tuple[float, float] | None = None
+    noise: float = 0.0
 
     @property
     def unknowns(self) -> int:
