@@ -53,9 +53,9 @@ class Limits:
             return distance / (self.radius_px if axis == "z" else self.f_px)
         if name in ("brightness_world_x", "brightness_world_y"):
             return self.f_px / (self.radius_px * distance)
-        if name in ("rotation_z", "brightness_tx", "brightness_ty"):
-            return 1 / self.radius_px
-        return 1.0
+        if stem == "rotation":
+            return np.where(np.isfinite(distance), 1 / self.radius_px if axis == "z" else 1.0, np.nan)
+        return 1 / self.radius_px if name in ("brightness_tx", "brightness_ty") else 1.0
 
 
 def settle(maps: MutableMapping[str, Array], measured: NDArray[np.bool_], limits: Limits) -> NDArray[np.uint8]:

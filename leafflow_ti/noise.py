@@ -17,6 +17,8 @@ _MASK = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 _BLOCK = 16
 """Side of the blocks [px] that are judged one by one."""
 _MOST_BLOCKS = 1024
+_MOST_FLAT = 0.2
+"""Share of a block's differences that may vanish, because they are rounded off or saturated."""
 _NORMAL_MEDIAN = 0.6745
 """Median of the size of a normal number of variance 1."""
 _QUIET, _QUIET_SHARE = 0.25, 0.912
@@ -52,8 +54,8 @@ def white_noise(image: NDArray[np.floating], rounded: bool) -> float:
     finite = np.isfinite(image)
     largest = float(np.max(np.abs(image[finite]), initial=0.0))
     least = 12**-0.5 if rounded else LEAST_NOISE * largest
-    medians = [float(np.median(some)) for block in _blocks(image) if (some := _differences(block)).size]
-    levels = [median for median in medians if median > 0]
+    found = [some for block in _blocks(image) if (some := _differences(block)).size]
+    levels = [float(np.median(some)) for some in found if np.mean(some == 0) < _MOST_FLAT]
     if not levels:
         return least or 1.0
     share = _QUIET_SHARE if len(levels) > 1 else 1.0

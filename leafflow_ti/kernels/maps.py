@@ -63,9 +63,10 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         plane: ti.i32, result: ti.template(), variance: ti.template(), p: ti.template(), target: ti.i32,
         ws: ti.template(),
     ):  # fmt: skip
-        """One map and its standard error."""
+        """One map and its standard error; no number where the variance is none, or negative by rounding."""
         ws[target + plane * p.stride] = result
-        ws[target + (Output.STD + plane) * p.stride] = ti.sqrt(ti.max(variance, V(0.0)))
+        std = ti.select(variance >= V(0.0), ti.sqrt(ti.max(variance, V(0.0))), V(nan))
+        ws[target + (Output.STD + plane) * p.stride] = std
 
     @ti.func
     def classify(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):

@@ -53,7 +53,7 @@ MIN_MASS = 0.2
 LEAST_SHARE = 5e-5
 """Share of the gradient's mean energy in a direction that is no texture, however little noise there is: what filters
 and rounding leave."""
-MISFIT_PX = 0.02
+MISFIT_PX = 0.05
 """Misfit of the brightness constraint that is usual without noise, as a displacement."""
 MAX_RESIDUAL_PX = 0.5
 """Root mean square misfit of the brightness constraint, as a displacement, above which a window is incoherent."""
