@@ -1,4 +1,4 @@
-"""What the texture does not determine has no value and an infinite standard error; what has a value is worth its error."""
+"""What the texture does not determine has no value and an infinite standard error; errors of the rest are as stated."""
 
 from __future__ import annotations
 
