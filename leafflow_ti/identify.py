@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.field import IDENTIFIED
+from leafflow_ti.status import HAS_VALUE, Status
 
 Array = NDArray[Any]
 
@@ -30,8 +31,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "flow": ("flow_",),
 }
 """Group -> how the names of its maps begin."""
-_NO_GROUP = ("normal_flow_x", "normal_flow_y")
-"""Maps with limits that are of no group."""
+_NORMAL_FLOW = ("normal_flow_x", "normal_flow_y")
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,14 @@ class Limits:
         return 1 / self.radius_px if name in ("brightness_tx", "brightness_ty") else 1.0
 
 
-def settle(maps: MutableMapping[str, Array], measured: NDArray[np.bool_], limits: Limits) -> NDArray[np.uint8]:
+def settle(maps: MutableMapping[str, Array], status: NDArray[np.uint8], limits: Limits) -> NDArray[np.uint8]:
     """Take the values away that the texture does not determine, in place; return ``field.IDENTIFIED`` bits [h, w].
 
-    ``maps``: name -> [h, w], standard errors as ``NAME_std``; ``measured`` [h, w]: pixels whose status has a value,
-    others are left alone and identify nothing. A group's bit is set where each of its maps is determined.
+    ``maps``: name -> [h, w], standard errors as ``NAME_std``. Pixels whose ``status`` [h, w] has no value are left
+    alone and identify nothing. A group's bit is set where each of its maps is determined. The normal flow is for
+    pixels with status aperture, others have none and no error.
     """
+    measured = np.isin(status, HAS_VALUE)
     identified = np.zeros(measured.shape, np.uint8)
     depth: Array | float = np.array(maps["depth"], np.float32) if "depth" in maps else 1.0
     for group, begins in GROUPS.items():
@@ -76,9 +78,11 @@ def settle(maps: MutableMapping[str, Array], measured: NDArray[np.bool_], limits
             if name == "depth":
                 depth = maps["depth"]  # NaN, which no standard error is below, where it is not determined
         identified[whole] |= IDENTIFIED[group]
-    for name in _NO_GROUP:
+    aperture = status == Status.APERTURE
+    for name in _NORMAL_FLOW:
         if name in maps:
-            _determined(maps, name, measured, limits.of(name, depth))
+            _determined(maps, name, aperture, limits.of(name, depth))
+            maps[name][~aperture] = maps[f"{name}_std"][~aperture] = np.nan
     return identified
 
 

@@ -272,7 +272,7 @@ class Pipeline:
         if stay is not None and stay.engine.refine and plan.refine:
             place = Place(y, x, (stay.wide.y, stay.wide.x), plan.geometry)
             self.effort += refine_maps(stay.engine.refine, plan.refine, framed, codes, place)
-            framed["identified"] = settle(framed, np.isin(codes, HAS_VALUE), plan.limits)
+            framed["identified"] = settle(framed, codes, plan.limits)
         unit = plan.y[plan.band(band)]
         inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
         return {n: framed[n][inner].copy() for n in plan.names}, codes[inner].copy()
@@ -335,9 +335,7 @@ class Pipeline:
                 maps[name] = sample.maps[name][centre].astype(np.float32)
             else:
                 maps[name] = planes[_plane_of(base) + (Output.STD if name != base else 0)].astype(np.float32)
-            if base.startswith("normal_flow"):
-                maps[name][status != Status.APERTURE] = np.nan
-        found = settle(maps, np.isin(status, HAS_VALUE), self.plan.limits)
+        found = settle(maps, status, self.plan.limits)
         # Texture in all directions, and nothing determined: the window is too small, or degenerate.
         status[(status == Status.OK) & (found == 0)] = Status.NOT_CONVERGED
         return {**maps, "identified": found}, status
