@@ -66,7 +66,7 @@ def white_noise(image: NDArray[np.floating], rounded: bool) -> float:
 
 
 def _blocks(image: NDArray[np.floating]) -> Array:
-    """Parts [n, y, x] of the image that give ``_BLOCK`` x ``_BLOCK`` differences each, evenly spread if they are many."""
+    """Parts [n, y, x] of the image with ``_BLOCK`` x ``_BLOCK`` differences each, spread evenly if they are many."""
     need = _BLOCK + _MASK.size - 1
     if min(image.shape) < need:
         return np.asarray(image[None], np.float64)

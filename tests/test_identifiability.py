@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from moving_texture import Moving, Texture, checks, half, plain, stripes
+import zarr
+from moving_texture import BASELINE_MM, F_PX, Moving, Texture, checks, half, plain, stripes
 
 import leafflow_ti as lf
+from leafflow_ti.capture import Geometry, capture_from_array
+from leafflow_ti.config import load_config
 from leafflow_ti.field import IDENTIFIED
+from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 
 MODELS = ["flow", "flow-affine", "affine", "affine-4d"]
@@ -103,3 +109,19 @@ def test_normal_flow_where_only_that_is_determined(model: str, angle: float, noi
         assert np.mean(error <= 4 * std[there]) >= 0.98
         # A noise of 5 of 40 grey values, windows of some 200 px: a hundredth of a pixel.
         assert np.median(error) < 0.005 * noise + 0.002
+
+
+def test_identified_groups_are_stored_as_flags(tmp_path: Path) -> None:
+    """Values that are lost, infinite errors and bits come back from a results store, with the meaning of the bits."""
+    moving = Moving(stripes(0.0), n_cameras=1)
+    field, out = moving.measure("flow"), tmp_path / "out.zarr"
+    config = load_config(overrides={"model": "flow", "window": 17, "sigma": 5.0, "frames": "3:4"})
+    lf.run(capture_from_array(moving.images(), Geometry(F_PX, (25.5, 21.5), (BASELINE_MM, BASELINE_MM))), out, config)
+    found = ResultStore.open(out).field(0)
+    assert set(found) == set(field)
+    for name in field:
+        assert found[name].dtype == field[name].dtype
+        np.testing.assert_array_equal(found[name], field[name], err_msg=name)
+    assert np.isinf(found["flow_y_std"]).any()
+    flags = zarr.open_group(out)["identified"].attrs
+    assert dict(zip(flags["flag_meanings"].split(), flags["flag_masks"], strict=True)) == IDENTIFIED
