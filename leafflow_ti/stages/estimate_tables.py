@@ -80,7 +80,7 @@ def _packed(a: int, b: int) -> int:
 SCALE_START = 1.0
 """Of the penalty's σ², per mean squared residual of the plain fit: everything counts, more or less."""
 SCALE_SHRINK = 0.5
-LEAST_NOISE, LEAST_PX = 2.0, 0.007
+LEAST_NOISE, LEAST_PX = 2.0, 0.02
 """Least σ² of the penalty: so many variances of the noise, and what models leave out, as a displacement."""
 MOST_NOISE, MOST_PX = 3.0, 0.02
 """Squared residual above which the plain fit failed, likewise."""
