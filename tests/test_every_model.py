@@ -162,7 +162,8 @@ def assert_equal_to_twin(folder: Path, choice: dict[str, object], maps: dict[str
     shift = tuple(float(p) for p in plan.preshift)
     view = View(geometry.f_px, geometry.principal_px, geometry.baseline_mm, shift, x, y, 4, 1, 1, 1)
     found = patch.measure(solved(block, problem.columns, sampling), problem, view, x, y, own)
-    assert {name for name in maps if not name.endswith("_std")} - {"growth_rate"} == set(found)
+    others = {"growth_rate", "normal_flow_x", "normal_flow_y", "confidence", "identified"}
+    assert {name for name in maps if not name.endswith("_std")} - others == set(found)
     for name, (value, std) in found.items():
         # Maps are stored in single precision.
         assert maps[name][1] == pytest.approx(value, rel=1e-6, abs=1e-4 * std), name

@@ -28,6 +28,7 @@ from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import filter_set
 from leafflow_ti.metrics import aae, erode
 from leafflow_ti.models import TensorLayout
+from leafflow_ti.noise import white_noise
 from leafflow_ti.progress import Progress
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import AxisSampling, Sampling
@@ -305,12 +306,12 @@ def test_noise_of_images() -> None:
     random = np.random.default_rng(2)
     y, x = np.mgrid[:80, :90]
     smooth = 100 + 40 * np.cos(0.3 * x) * np.sin(0.25 * y)
-    assert range_flow.white_noise(smooth + random.normal(0, 1.5, x.shape), False) == pytest.approx(1.5, rel=0.1)
-    assert range_flow.white_noise(np.round(smooth), True) == pytest.approx(12**-0.5, rel=0.2)
+    assert white_noise(smooth + random.normal(0, 1.5, x.shape), False) == pytest.approx(1.5, rel=0.1)
+    assert white_noise(np.round(smooth), True) == pytest.approx(12**-0.5, rel=0.2)
     flat = np.full(x.shape, 20.0)
     flat[:, :40] += random.normal(0, 1.5, (80, 40))
-    assert range_flow.white_noise(flat, False) == pytest.approx(1.5, rel=0.2)
-    assert range_flow.white_noise(np.full((20, 20), 7.0), True) == pytest.approx(12**-0.5)
+    assert white_noise(flat, False) == pytest.approx(1.5, rel=0.2)
+    assert white_noise(np.full((20, 20), 7.0), True) == pytest.approx(12**-0.5)
 
 
 @pytest.mark.parametrize(
