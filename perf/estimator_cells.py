@@ -84,7 +84,7 @@ def _sampling(model: str, size: int, stride: int) -> Sampling:
 def _schemes(settings: Settings, noise: float) -> dict[str, Callable[[Any], Any]]:
     """The weighted estimators as functions of the cells; the penalty's scale fixed at a multiple of the noise."""
     estimators, rounds = twins()[2], settings.rounds
-    fixed = estimators.Schedule(0.0, 1.0, settings.sigma**2, 0.0, 0, rounds, noise**2)
+    fixed = estimators.Schedule(0.0, 1.0, estimators.Level(settings.sigma**2), 0, 0, rounds, noise**2)
     return {
         "sampson": lambda cells: estimators.sampson(cells, rounds),
         "fns": lambda cells: estimators.fns(cells, rounds),

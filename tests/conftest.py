@@ -211,7 +211,7 @@ class Bench:
             ..., y - self.band.halo_y : y + self.band.halo_y + 1, x - self.band.halo_x : x + self.band.halo_x + 1
         ]
         at = (self.band.halo_x, self.band.halo_y)
-        return [window(self.own_images(*s)[part], *self.own_columns, at, None, weighed) for s in self.steps]
+        return [weighted.window(self.own_images(*s)[part], *self.own_columns, at, None, weighed) for s in self.steps]
 
     @cached_property
     def planes(self) -> np.ndarray:
@@ -234,7 +234,7 @@ class Bench:
     @functools.cache  # noqa: B019 - a bench lives as long as the session
     def reference(self, row: int, col: int, weighed: bool = False) -> tuple[Any, float]:
         """J [N, N] or, where windows are weighted, the cells of one output pixel by the naive twin; and ρ."""
-        return window(self.images, self.sampling, self.columns, self.position(row, col), self.valid, weighed)
+        return weighted.window(self.images, self.sampling, self.columns, self.position(row, col), self.valid, weighed)
 
     def solved(self, row: int, col: int, problem: Problem) -> tuple[chain.Solved, list[chain.Solved]]:
         """What the naive twin finds at one output pixel, and from every camera's own flow."""
@@ -289,7 +289,9 @@ class Bench:
                 without = options.pop("without", ())
                 kept = [i for i in range(len(self.steps)) if i not in without]
                 lost = options.pop("lost", ())
-                tensors = self._chosen(kept, lost) if lost or without else tensors
+                if lost or without:
+                    assert not sources
+                    tensors = self._chosen(kept, lost)
                 options["own_flows"] = OwnFlows(
                     columns, sampling, tuple(self.steps[i] for i in kept), own, unknowns, model.reference_rows, growth
                 )
@@ -306,7 +308,10 @@ class Bench:
         return Estimated(problem, planes, parameters.reshape(*parameters.shape[:2], k, flow), variance)
 
     def _chosen(self, kept: Sequence[int], lost: Sequence[int]) -> Any:
-        """The grid's tensor and those of the ``kept`` own flows; of these, ``lost`` ones are all zero."""
+        """The grid's tensor and those of the ``kept`` own flows; of these, ``lost`` ones are all zero.
+
+        Without what windows are weighted by: for estimators that do not.
+        """
         stage, tensors = self._tensor
         own = TensorLayout.of(self.own_columns[1])
         sizes = [len(layout.entries) + EXTRA_PLANES for layout in (self.layout, *[own] * len(self.steps))]
@@ -327,17 +332,6 @@ class Bench:
         else:
             found = workspace.reshape(groups, n, lanes).transpose(1, 0, 2).reshape(n, pixels)
         return found[first : first + size].T.reshape(self.band.rows, -1, size)[:, : self.band.cols]
-
-
-def window(
-    images: np.ndarray, sampling: Sampling, columns: ColumnSet, at: tuple[int, int], valid: np.ndarray | None,
-    cells: bool,
-) -> tuple[Any, float]:  # fmt: skip
-    """J or the cells of the window around the pixel ``at`` (x, y) by the naive twin, and ρ."""
-    rho = chain.texture_smoothness(images, sampling, *at)
-    if cells:
-        return weighted.Cells.at(images, sampling, columns, at, valid), rho
-    return chain.structure_tensor(images, sampling, columns, [at], valid)[0], rho
 
 
 MakeBench = Callable[..., Bench]

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from conftest import Bench, Estimated
 from reference import estimators as twin
-from reference.estimators import PENALTIES, Cells
+from reference import patch
+from reference.estimators import PENALTIES
 from reference.sequences import affine_sequence
 from test_kernels_estimate import assert_maps_equal
 from tolerances import tolerance
@@ -109,13 +110,20 @@ def boundary_bench(
 
 @pytest.mark.parametrize("penalty", PENALTIES)
 @pytest.mark.parametrize("estimator", ROBUST)
-def test_penalties_at_a_motion_boundary(make_bench: Callable, estimator: str, penalty: str, precision: str) -> None:
-    """A truncated residual in single precision may fall on the other side of the threshold: that is left out."""
-    if penalty == "truncated" and precision == "f32":
-        penalty = "lorentzian"
-    b = boundary_bench(make_bench, precision)
+def test_penalties_at_a_motion_boundary(make_bench: Callable, estimator: str, penalty: str) -> None:
+    """Where next to no cell is left (truncated, over-relaxation), the few decide by their rounding: not compared.
+
+    Double precision: in single, truncated residuals fall on either side of the threshold.
+    """
+    b = boundary_bench(make_bench, "f64")
     found = b.estimate(estimator=estimator, penalty=penalty, robust="all", noise=1.0, solver="jacobi")
-    assert_parameters_equal(b, found)
+    kept = []
+    for pixel in PIXELS:
+        cells, _ = b.reference(*pixel, True)
+        if np.average(twin.estimate(cells, found.problem).weights, weights=cells.w) > 0.02:
+            kept.append(pixel)
+    assert len(kept) >= 2
+    assert_parameters_equal(b, found, tuple(kept))
 
 
 @pytest.mark.parametrize("estimator", ["tls-equilibrated", "sampson", "for3", "robust-tls"])
@@ -186,8 +194,8 @@ def test_only_what_failed_is_estimated_anew(make_bench: Callable, estimator: str
     np.testing.assert_array_equal(found.parameters[changed], every.parameters[changed])
     pixels = tuple((row, col) for row in (0, 2) for col in (0, 1, 13, 19, 26, 33, 39))
     for pixel in pixels:
-        cells = Cells.at(b.images, b.sampling, b.columns, b.position(*pixel))
-        assert changed[pixel] == (np.any(twin.estimate(cells, found.problem).weights != 1)), pixel
+        cells, _ = b.reference(*pixel, True)
+        assert changed[pixel] == twin.estimate(cells, found.problem).anew, pixel
     assert_parameters_equal(b, found, pixels)
 
 
@@ -204,3 +212,20 @@ def test_the_noise_level_is_the_least_scale(make_bench: Callable, estimator: str
     assert off[0] > 0.05
     # Over-relaxation has not quite arrived; total least squares weighs by the noise of the cells, too.
     assert off[1] < 1e-6 if estimator == "robust-ols" else off[1] < 0.1 * off[0]
+
+
+def test_own_flows_that_contradict_are_left_out(
+    bench: Callable, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One camera sees everything run backwards: a robust estimate leaves its flow out, as the twin does."""
+    b = bench("affine-scene-flow", "none", "line-x", precision)
+    images = b.images.copy()
+    images[:, 0, 0] = images[::-1, 0, 0]
+    spoiled = Bench(b.device, images, b.sampling, b.columns, b.band, b.model)
+    found = spoiled.estimate("rotation", estimator="robust-tls", robust="all", noise=1.0)
+    assert_maps_equal(spoiled, found)
+    monkeypatch.setattr(patch, "MAX_CONTRADICTION", np.inf)
+    solved, own = spoiled.solved(*PIXELS[0], found.problem)
+    taken_in = patch.measure(solved, found.problem, spoiled.view, *spoiled.position(*PIXELS[0]), own)
+    value, std = (m[PIXELS[0]] for m in found.map("velocity_x"))
+    assert abs(taken_in["velocity_x"][0] - value) > 0.5 * std

@@ -11,7 +11,7 @@ import conftest
 import numpy as np
 import pytest
 from reference import chain, estimators
-from reference.estimators import PENALTIES, Cells, Schedule
+from reference.estimators import PENALTIES, Cells, Level, Schedule
 from reference.sequences import affine_sequence
 from scipy.optimize import minimize
 
@@ -219,7 +219,7 @@ def test_where_all_cells_are_equally_noisy_nothing_is_weighted() -> None:
         np.testing.assert_allclose(found.weights, 1.0, rtol=1e-12)
 
 
-FIXED = Schedule(start=0.0, shrink=1.0, least=1.0, floor_px=0.0, translation=0, affine=400, noise=6.0)
+FIXED = Schedule(start=0.0, shrink=1.0, least=Level(1.0), translation=0, narrow=0, wide=400, noise=6.0)
 """σ² is the noise variance from the first round on."""
 
 
@@ -262,7 +262,9 @@ def test_the_weight_is_the_derivative_of_the_penalty(penalty: str) -> None:
     np.testing.assert_allclose(psi(u), (rho(u + 1e-6) - rho(u - 1e-6)) / 2e-6, rtol=1e-5, atol=1e-9)
 
 
-GRADUATED = Schedule(start=1.0, shrink=0.7, least=2.0, floor_px=0.0, translation=4, affine=14, noise=1.0)
+GRADUATED = Schedule(
+    start=1.0, shrink=0.7, least=Level(2.0), translation=4, narrow=4, wide=10, noise=1.0, width=0.3
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("penalty", PENALTIES)
@@ -271,7 +273,7 @@ def test_the_larger_motion_wins(scheme: str, penalty: str) -> None:
     """The plain fit mixes both motions; graduated σ leads to the one that holds two thirds of the window."""
     cells = boundary_cells()
     if scheme == "sor":
-        found = estimators.robust_ols_sor(cells, penalty, replace(GRADUATED, affine=60), 1.5)
+        found = estimators.robust_ols_sor(cells, penalty, replace(GRADUATED, wide=60), 1.5)
     else:
         found = (estimators.robust_ols if scheme == "irls" else estimators.robust_tls)(cells, penalty, GRADUATED)
     wanted = np.array([0.3, -0.2])
@@ -285,32 +287,45 @@ def test_the_larger_motion_wins(scheme: str, penalty: str) -> None:
 def test_translation_comes_first() -> None:
     cells = boundary_cells()
     for scheme in (estimators.robust_ols, estimators.robust_tls):
-        still = scheme(cells, "lorentzian", replace(GRADUATED, affine=0)).P
+        still = scheme(cells, "lorentzian", replace(GRADUATED, narrow=0, wide=0)).P
         moving = [i for i, c in enumerate(cells.columns.columns[:-1]) if c.offset == "1"]
         assert np.all(still[moving] != 0)
         assert np.count_nonzero(still) == len(moving) == 2
 
 
-def test_sigma_falls_to_its_floor() -> None:
+def test_the_middle_of_the_window_chooses() -> None:
+    """A window whose middle holds less than half of it: the larger motion wins, but for rounds of a narrow window."""
+    sampling = flow_sampling(31)
+    side = 2 * sampling.x.radius + 1
+    middle, border = np.array([[0.3, 0, 0], [-0.2, 0, 0]]), np.array([[-0.5, 0, 0], [0.4, 0, 0]])
+    images, other = (
+        affine_sequence(flow, 5, (side, side), noise=1.0, seed=seed) for seed, flow in enumerate((border, middle))
+    )
+    strip = slice(side // 2 - 4, side // 2 + 5)
+    images[..., strip] = other[..., strip]
+    cells = Cells.at(images, sampling, columns_of("flow", sampling), (side // 2, side // 2))
+    for width, wanted in ((0.3, middle), (100.0, border)):
+        found = estimators.robust_ols(cells, "geman-mcclure", replace(GRADUATED, width=width)).P
+        assert np.hypot(*(found[:, 0] - wanted[:, 0])) < 0.05
+
+
+def test_sigma_falls_to_its_least() -> None:
     """From ``start`` times the residual of the translation by ``shrink`` a round."""
     cells = boundary_cells("flow")
-    schedule = replace(GRADUATED, floor_px=0.05)
     energy = 0.5 * (cells.tensor[0, 0] + cells.tensor[1, 1])
-    floor = 0.05**2 * energy / cells.noise[-1]
-    assert floor > 1.0
-    assert schedule.floor(cells) == pytest.approx(floor)
-    assert replace(schedule, noise=2 * floor).floor(cells) == pytest.approx(2 * floor)
+    least = 2.0 + 0.05**2 * energy / cells.noise[-1]
+    assert least > 3.0
+    assert Level(2.0, 0.05).of(cells, 1.0) == pytest.approx(least)
     first = (cells.tensor @ np.append(estimators.plain(cells, "ols").P, 1.0))[-1] / cells.noise[-1]
+    start, measures = estimators.plain(cells, "ols").P, estimators.plain_measures(cells)
     for rounds in (0, 1, 30):
-        asked = []
+        asked: list[float] = []
 
         def psi(u: np.ndarray, asked: list[float] = asked) -> np.ndarray:
             asked.append(float(u[0]))
             return np.ones_like(u)
 
-        scheme = replace(schedule, translation=1, affine=rounds)
-        start = estimators.plain(cells, "ols").P
-        measures = estimators.plain_measures(cells)
-        estimators.graduated(cells, start, measures, psi, estimators.least_squares, scheme)
+        schedule = replace(GRADUATED, least=Level(2.0, 0.05), translation=1, narrow=0, wide=rounds, width=1e6)
+        estimators.graduated(cells, start, measures, psi, estimators.least_squares, schedule)
         squares = [measures(start)[0][0] / u for u in asked]  # with weights 1 the solution stays
-        assert squares == pytest.approx([max(first * 0.7**n, 2 * floor) for n in range(rounds + 1)])
+        assert squares == pytest.approx([max(first * 0.7**n, least) for n in range(rounds + 1)])

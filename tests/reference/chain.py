@@ -153,6 +153,7 @@ class Solved:
 
     ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
     the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
+    ``anew``: the window was weighted anew.
     """
 
     J: np.ndarray
@@ -160,6 +161,7 @@ class Solved:
     variance: np.ndarray
     noise: np.ndarray
     rho: float
+    anew: bool = False
 
     @classmethod
     def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):

@@ -20,6 +20,7 @@ from scipy.linalg import eigh
 from leafflow_ti.models import ColumnSet
 from leafflow_ti.sampling import Sampling, column_noise, noise_gain
 from leafflow_ti.stages import estimate_tables as tables
+from leafflow_ti.stages.cells import NARROW
 from leafflow_ti.stages.estimators import fns as fns_stages
 from leafflow_ti.stages.estimators import for3 as for3_stages
 from leafflow_ti.stages.estimators import robust as robust_stages
@@ -30,13 +31,15 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Cells:
-    """Cells of one window: ``J`` and ``C`` [cells, N, N], ``w`` [cells]; ``noise`` [N] is the diagonal of C̄."""
+    """Cells of one window: ``J`` and ``C`` [cells, N, N], ``w`` [cells]; ``noise`` [N] is the diagonal of C̄;
+    ``distance`` [cells]: squared, from the middle of the window, relative to its second moment along x and y."""
 
     J: Array
     w: Array
     C: Array
     columns: ColumnSet
     noise: Array
+    distance: Array
 
     @classmethod
     def of(cls, vectors, seen, sampling: Sampling, columns: ColumnSet, exact=False):
@@ -46,7 +49,7 @@ class Cells:
         mass = partial(cell_sums, [np.ones((1, *vectors[0].shape[1:]))], sampling=sampling, exact=exact)
         return cls(
             cell_sums(vectors, seen, sampling, exact), mass(seen=seen)[:, 0, 0], C / mass(seen=whole), columns,
-            column_noise(sampling, columns),
+            column_noise(sampling, columns), distances(sampling, exact),
         )  # fmt: skip
 
     @classmethod
@@ -58,6 +61,14 @@ class Cells:
     def tensor(self):
         """J [N, N] of the window."""
         return self.J.sum(axis=0)
+
+
+def window(images, sampling: Sampling, columns: ColumnSet, at, valid, cells):
+    """J [N, N] or, with ``cells``, the cells of the window around the pixel ``at`` (x, y), and ρ."""
+    rho = chain.texture_smoothness(images, sampling, *at)
+    if cells:
+        return Cells.at(images, sampling, columns, at, valid), rho
+    return chain.structure_tensor(images, sampling, columns, [at], valid)[0], rho
 
 
 def noise_vectors(sampling: Sampling, columns: ColumnSet):
@@ -90,6 +101,15 @@ def cell_sums(vectors, seen, sampling: Sampling, exact):
     return cells.reshape(-1, *cells.shape[2:])
 
 
+def distances(sampling: Sampling, exact):
+    """Squared distance [cells] of cells from the middle of the window, x and y relative to the window's moments."""
+    if exact:
+        grids = chain.offsets(sampling)
+        return sum(grids[a].ravel() ** 2 / sampling.axis(a).moment(2) for a in ("x", "y"))
+    y, x = (sampling.axis(a).blocked.centres ** 2 / sampling.axis(a).moment(2) for a in ("y", "x"))
+    return np.add.outer(y, x).ravel()
+
+
 def block_weights(axis):
     """Weights [blocks, samples] that the blocks of an axis give to its samples."""
     blocks = axis.blocked
@@ -119,11 +139,16 @@ class Found:
         scaled = normalised(cells, weights) * weights * cells.w
         return cls(P, *weighted(cells, weights), weights, float(scaled**2 @ S / np.sum(cells.w**2)))
 
+    @property
+    def anew(self):
+        """Whether cells have weights of their own."""
+        return bool(np.any(self.weights != 1))
+
     def solved(self, rho):
         """What covariances follow from; ``rho`` is the smoothness of the texture."""
         p = full(self.P)
         variance = np.einsum("ik,ij,jk->k", p, self.M, p) / np.einsum("ik,ij,jk->k", p, self.N, p)
-        return chain.Solved(self.M, self.P, variance, self.N, rho * self.spread)
+        return chain.Solved(self.M, self.P, variance, self.N, rho * self.spread, self.anew)
 
 
 def full(P):
@@ -231,52 +256,66 @@ PENALTIES: dict[str, tuple[Callable, Callable]] = {
 
 
 @dataclass(frozen=True)
-class Schedule:
-    """How the scale σ of the penalty falls, and what is estimated meanwhile.
+class Level:
+    """A residual variance that grows with the noise and with what models leave out: ``noise`` times its variance, and
+    that of a misplacement by ``px``."""
 
-    σ² is ``start`` times the mean residual, times ``shrink`` after every round, at least ``least`` times the floor: the
-    larger one of the variance ``noise`` and that of a misplacement by ``floor_px``. In the first ``translation`` rounds
-    the columns without offset are estimated alone, from their fit without weights on; in ``affine`` rounds all columns.
+    noise: float
+    px: float = 0.0
+
+    def of(self, cells: Cells, noise):
+        """For the noise variance ``noise``."""
+        columns = cells.columns
+        energy = np.mean([cells.tensor[i, i] for i in (columns.index("x"), columns.index("y"))]) / cells.w.sum()
+        return self.noise * noise + self.px**2 * energy / np.mean(cells.noise[-columns.n_time_like :])
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How the scale σ of the penalty falls, and what is estimated meanwhile; ``noise``: variance of the images' noise.
+
+    σ² is ``start`` times the mean residual, times ``shrink`` after every round, at least the level ``least``. In the
+    first ``translation`` rounds the columns without offset are estimated alone, in the others all columns. In these
+    rounds and ``narrow`` further ones the middle of the window counts most, by a Gaussian of ``width`` times the
+    window's; then there are ``wide`` rounds. The translation starts at its fit without a penalty.
     """
 
     start: float
     shrink: float
-    least: float
-    floor_px: float
+    least: Level
     translation: int
-    affine: int
+    narrow: int
+    wide: int
     noise: float = 0.0
-
-    def floor(self, cells: Cells):
-        """Residual variance that is no sign of a failure."""
-        columns = cells.columns
-        energy = np.mean([cells.tensor[i, i] for i in (columns.index("x"), columns.index("y"))]) / cells.w.sum()
-        return max(self.noise, self.floor_px**2 * energy / np.mean(cells.noise[-columns.n_time_like :]))
-
-
-def mean_residual(cells: Cells, R):
-    """Residual variance of the window from those of its cells."""
-    return (cells.w @ R) / cells.w.sum()
+    width: float = 1.0
 
 
 def graduated(cells: Cells, P, measures, psi, solve, schedule: Schedule):
-    """Rounds of ``solve(M, N, mean weight, columns, P)`` with weights ``ψ(R / S / σ²) / S``.
+    """Rounds of ``solve(M, N, columns, P, step)`` with weights ``ψ(R / S / σ²) / S``; ``step``: the mean weight, by
+    which steps are shorter, or None for the columns without offset alone: they are always solved for.
 
-    ``P``: where there is no translation round, the start. ``measures``: R and S of every cell by the parameters.
+    ``P``: of the plain fit. ``measures``: R and S of every cell by the parameters.
     """
-    columns = cells.columns
+    columns, before = cells.columns, np.ones_like(cells.w)
+    near = np.exp(-0.5 * cells.distance / schedule.width**2)
     still = [i for i, c in enumerate(columns.columns) if c.offset == "1"]
+
+    def solved(P, weights, first):
+        active = still if first else list(range(columns.n))
+        step = None if first else 1 / normalised(cells, weights)
+        return expanded(solve(*weighted(cells, weights), active, P, step), active, columns)
+
     if schedule.translation:
-        P = expanded(solve(cells.tensor, np.diag(cells.noise), 1.0, still, P), still, columns)
-    least = schedule.least * schedule.floor(cells)
-    square = max(schedule.start * mean_residual(cells, measures(P)[0]), least)
-    for number in range(schedule.translation + schedule.affine):
-        active = still if number < schedule.translation else list(range(columns.n))
+        before = near / relative_noise(cells, P)
+        P = solved(P, before, True)
+    least = schedule.least.of(cells, schedule.noise)
+    square = max(schedule.start * np.average(measures(P)[0], weights=before * cells.w), least)
+    for number in range(schedule.translation + schedule.narrow + schedule.wide):
         R, S = measures(P)
         weights = psi(R / S / square) / S
-        P = expanded(
-            solve(*weighted(cells, weights), 1 / normalised(cells, weights), active, P), active, columns
-        )  # fmt: skip
+        if number < schedule.translation + schedule.narrow:
+            weights = weights * near
+        P = solved(P, weights, number < schedule.translation)
         square = max(schedule.shrink * square, least)
     return Found.of(cells, P, weights, S)
 
@@ -288,7 +327,7 @@ def expanded(P, active, columns: ColumnSet):
     return out
 
 
-def least_squares(M, N, share, active, P):
+def least_squares(M, N, active, P, step):
     """Parameters of the ``active`` columns: ``M_ff p = -M_f,time``."""
     k = P.shape[1]
     A = M[np.ix_(active, active)]
@@ -314,13 +353,13 @@ def robust_ols_sor(cells: Cells, penalty, schedule: Schedule, factor, sweeps=1):
     """
     bound = np.diag(cells.tensor)
 
-    def relax(M, N, share, active, P):
-        if len(active) < cells.columns.n:
-            return least_squares(M, N, share, active, P)
+    def relax(M, N, active, P, step):
+        if step is None:
+            return least_squares(M, N, active, P, step)
         P = P.copy()
         for _ in range(sweeps):
             for i in range(len(P)):
-                P[i] -= factor * share * (M[i] @ full(P)) / bound[i]
+                P[i] -= factor * step * (M[i] @ full(P)) / bound[i]
         return P
 
     start = plain(cells, "ols").P
@@ -333,7 +372,7 @@ def robust_tls(cells: Cells, penalty, schedule: Schedule):
     def measures(P):
         return residuals(cells, P), relative_noise(cells, P)
 
-    def solve(M, N, share, active, P):
+    def solve(M, N, active, P, step):
         some = np.ix_(active, active)
         return generalised(M[some], N[some], P.shape[1])
 
@@ -345,12 +384,12 @@ ROBUST = {"robust-ols": "ols", "robust-ols-sor": "ols", "robust-tls": "tls-equil
 """Robust estimators, and the plain ones that must have failed where they are wanted."""
 
 
-def failed(cells: Cells, estimator, schedule: Schedule, factor):
-    """Whether the residual of the plain fit is above ``factor`` times its floor."""
+def failed(cells: Cells, estimator, most: Level, noise):
+    """Whether the residual of the plain fit is above the level ``most``; ``noise``: variance of the images' noise."""
     plain_fit = ROBUST[estimator]
     P = plain(cells, plain_fit).P
     R = plain_measures(cells)(P)[0] if plain_fit == "ols" else residuals(cells, P)
-    return mean_residual(cells, R) > factor * schedule.floor(cells)
+    return np.average(R, weights=cells.w) > most.of(cells, noise)
 
 
 def estimate(cells: Cells, problem):
@@ -363,11 +402,13 @@ def estimate(cells: Cells, problem):
         return for3(cells, rounds[name])
     if name not in ROBUST:
         return plain(cells, name, problem.scale)
+    variance = problem.noise**2
     schedule = Schedule(
-        tables.SCALE_START, tables.SCALE_SHRINK, tables.SCALE_LEAST, tables.FLOOR_PX,
-        robust_stages.TRANSLATION_ROUNDS, robust_stages.ROUNDS, problem.noise**2,
+        tables.SCALE_START, tables.SCALE_SHRINK, Level(tables.LEAST_NOISE, tables.LEAST_PX),
+        robust_stages.TRANSLATION_ROUNDS, robust_stages.NARROW_ROUNDS, robust_stages.ROUNDS, variance, NARROW,
     )  # fmt: skip
-    if problem.robust == "failed" and not failed(cells, name, schedule, tables.FAILED):
+    most = Level(tables.MOST_NOISE, tables.MOST_PX)
+    if problem.robust == "failed" and not failed(cells, name, most, variance):
         return plain(cells, ROBUST[name])
     if name == "robust-ols-sor":
         return robust_ols_sor(cells, problem.penalty, schedule, tables.RELAXATION, robust_stages.SWEEPS)

@@ -5,7 +5,8 @@ from reference.chain import solution_noise
 
 from leafflow_ti.models import AXES, ColumnSet
 from leafflow_ti.sampling import difference_variance
-from leafflow_ti.stages.estimate_tables import DENOISE, MODEL_ERROR, TURNING_ERROR
+from leafflow_ti.stages.estimate_tables import DENOISE, MAX_CONTRADICTION, MODEL_ERROR, TURNING_ERROR
+from leafflow_ti.stages.estimators import ESTIMATORS
 
 
 def fit_geometry(P, cov, columns: ColumnSet, baseline, shift, weighted=True):
@@ -278,6 +279,12 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
     sets, common = ([first], []) if problem.own_flows.reference_rows else ([], [])
     for step, one in zip(problem.own_flows.steps, own, strict=True):
         found, shared = own_rows(step, one, q)
+        if ESTIMATORS[problem.estimator].robust and problem.own_flows.reference_rows and one.anew:
+            # A robust estimate may have chosen another surface in this camera.
+            A, value, C, D, _, left_out, _ = found
+            own_errors = np.diag(C + D @ cov_g @ D.T + left_out)
+            if np.mean((value - A @ q) ** 2 / own_errors) > MAX_CONTRADICTION:
+                continue
         if problem.own_flows.reference_rows:
             common.append(np.pad(shared[rows], ((0, problem.use_range), (0, 0))))
         elif sets:
