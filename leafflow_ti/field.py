@@ -51,12 +51,13 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "strain_rate_22": ("%/frame", "strain rate in the surface at right angles to that tangent"),
     "strain_rate_12": ("%/frame", "shear strain rate in the surface, between the two"),
     "confidence": ("1", "confidence in the estimate, 0 to 1"),
+    "support": ("1", "share of the window that a robust estimate rests on, 1 where the plain fit did not fail"),
     "identified": ("1", "groups of parameters that the texture determines"),
 }
 """Name of a map -> (unit, long name). Every map may have a companion ``NAME_std``, its standard error, but for those
 ``WITHOUT_STD``."""
 
-WITHOUT_STD = ("confidence", "identified")
+WITHOUT_STD = ("confidence", "support", "identified")
 IDENTIFIED: dict[str, int] = {
     name: 1 << bit
     for bit, name in enumerate(("depth", "normals", "translation", "rotation", "acceleration", "brightness", "flow"))

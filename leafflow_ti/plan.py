@@ -20,6 +20,7 @@ from leafflow_ti.models import MODELS, TensorLayout
 from leafflow_ti.noise import noise_level
 from leafflow_ti.range_plan import RangePlan, range_problem
 from leafflow_ti.refine_plan import Refinement, plan_refinement
+from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, Problem
 
 
@@ -116,7 +117,9 @@ class Plan:
         names += [WORLD_MAPS[o] for o in problem.world_brightness]
         if "depth" in names and problem.unknowns >= 3:
             names.append("growth_rate")
-        return (*names, "confidence", "identified")
+        names.append("confidence")
+        names += ["support"] if ESTIMATORS[problem.estimator].robust else []
+        return (*names, "identified")
 
     @property
     def limits(self) -> Limits:

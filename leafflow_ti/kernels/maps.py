@@ -39,7 +39,8 @@ class Output(IntEnum):
     DIFFERENCES = 52  # 2 x packed [3]: covariance of the velocity's difference quotients along x and y
     STATUS = 64
     CONFIDENCE = 65
-    PLANES = 66
+    SUPPORT = 66
+    PLANES = 67
 
 
 EXPECTED = 10.0
@@ -119,6 +120,9 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         agreement = ti.max(expected - energy, V(0.0)) / ti.max(expected + energy, V(TINY))
         beyond = ti.max(weakest - floor * precise(0.5), V(0.0))
         structure = beyond / ti.max(beyond + energy, V(TINY))
+        if number[p.n + Number.REWEIGHTED] == 1:
+            share = ws[region(p, number, Region.SHARE)]
+            ws[target + Output.SUPPORT * p.stride] = ti.min(share, V(1.0))
         ws[target + Output.CONFIDENCE * p.stride] = agreement * agreement * structure * structure
         ws[target + Output.STATUS * p.stride] = ti.select(mass < V(value[p.v + Value.MIN_MASS]), V(border), result)
 
