@@ -19,7 +19,7 @@ from leafflow_ti.bands import WRITE_BEHIND
 from leafflow_ti.capture import Capture, open_capture
 from leafflow_ti.config import RunConfig, load_config
 from leafflow_ti.errors import RunError
-from leafflow_ti.field import Field, status_counts
+from leafflow_ti.field import Field, empty_map, status_counts
 from leafflow_ti.pipeline import Maps, Pipeline
 from leafflow_ti.plan import Plan, Unit, make_plan
 from leafflow_ti.progress import Progress, RunSummary, Timings
@@ -59,7 +59,7 @@ def estimate(capture: Capture | str | Path, frame: int | None = None, **options:
     device = start_device(config)
     pipeline = Pipeline(plan, capture, device)
     shape = (len(plan.y), len(plan.x))
-    maps: Maps = {name: np.full(shape, np.nan, np.float32) for name in plan.names}
+    maps: Maps = {name: empty_map(name, shape) for name in plan.names}
     status = np.zeros(shape, np.uint8)
 
     def deliver(unit: Unit, found: Maps, codes: NDArray[np.uint8]) -> None:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from leafflow_ti.config_values import auto_or_integer, integer, machine_memory, numbers, parse_memory
+from leafflow_ti.config_values import auto_or_integer, integer, machine_memory, noise_or_auto, numbers, parse_memory
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
 from leafflow_ti.filters import MAX_BLUR
@@ -62,6 +62,7 @@ _AutoCount = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v,
 _AutoSteps = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 0, high=50))]
 _AutoDegree = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, 5, odd=True, high=7))]
 _AutoRefined = Annotated[int | _Auto, BeforeValidator(lambda v: auto_or_integer(v, REFINED_WINDOW, odd=True))]
+_Noise = Annotated[float | _Auto, BeforeValidator(noise_or_auto)]
 _Width = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -79,6 +80,8 @@ class ModelSection(_Section):
 
     ``scale`` of the coordinates in a window, for estimators that depend on it: tls, sampson, fns. ``penalty`` on the
     residuals of the robust estimators, which estimate anew where the plain fit ``failed``, or ``all`` pixels.
+    ``noise``: standard deviation of the images' noise in grey values; auto: estimated from the middle frame of the
+    reference camera.
     """
 
     name: ModelName = "auto"
@@ -93,6 +96,7 @@ class ModelSection(_Section):
     penalty: Penalty = "lorentzian"
     robust: Robust = "failed"
     weighting: Weighting = "wls"
+    noise: _Noise = "auto"
 
     @field_validator("rows")
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable
@@ -58,6 +59,19 @@ def auto_or_integer(value: object, low: int, odd: bool = False, high: int | None
         return integer(value, low, odd, high)
     except ValueError as error:
         raise ValueError(f'{error}, or "auto"') from None
+
+
+def noise_or_auto(value: object) -> object:
+    """A standard deviation in grey values, or ``"auto"``; else ValueError."""
+    if value == "auto":
+        return value
+    try:
+        number = float(str(value))
+    except ValueError:
+        number = math.nan
+    if not 0 <= number < math.inf:
+        raise ValueError('must be a number of grey values >= 0, or "auto"')
+    return number
 
 
 def numbers(value: object, counts: tuple[int, ...], form: str) -> tuple[int, ...]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from leafflow_ti.plan import Plan
@@ -43,11 +43,12 @@ class Engine:
         """The kept stages if they are the ones, else new ones. ``view``: of an output of a given pitch."""
         problem, filters = plan.problem, plan.config.filters
         key = (
-            device, problem, plan.layout, band, plan.differences, filters.prefilter, filters.sigma_pre, apart,
-            plan.refine, (plan.geometry, plan.preshift) if plan.refine else None,
+            device, replace(problem, noise=0.0), plan.layout, band, plan.differences, filters.prefilter,
+            filters.sigma_pre, apart, plan.refine, (plan.geometry, plan.preshift) if plan.refine else None,
         )  # fmt: skip
         kept = _take(key)
         if kept is not None and not plan.ranges:
+            kept.estimate.set_noise(problem.noise)
             return kept
         own = problem.own_flows.requests if problem.own_flows else ()
         weighed = ESTIMATORS[problem.estimator].weighs

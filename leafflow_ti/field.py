@@ -6,7 +6,7 @@ columns in the reference image (a stride above 1 leaves pixels out). Lengths are
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,8 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "acceleration_z": ("mm/frame²", "surface acceleration along Z"),
     "flow_x": ("px/frame", "optical flow along x"),
     "flow_y": ("px/frame", "optical flow along y"),
+    "normal_flow_x": ("px/frame", "x component of the optical flow along the gradient"),
+    "normal_flow_y": ("px/frame", "y component of the optical flow along the gradient"),
     "brightness_t": ("1/frame", "relative brightness change per frame"),
     "brightness_tx": ("1/(frame px)", "relative brightness change per frame, slope along x"),
     "brightness_ty": ("1/(frame px)", "relative brightness change per frame, slope along y"),
@@ -48,8 +50,19 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "strain_rate_11": ("%/frame", "strain rate in the surface along its tangent in the plane of X and Z"),
     "strain_rate_22": ("%/frame", "strain rate in the surface at right angles to that tangent"),
     "strain_rate_12": ("%/frame", "shear strain rate in the surface, between the two"),
+    "confidence": ("1", "confidence in the estimate, 0 to 1"),
+    "support": ("1", "share of the window that a robust estimate rests on, 1 where the plain fit did not fail"),
+    "identified": ("1", "groups of parameters that the texture determines"),
 }
-"""Name of a map -> (unit, long name). Every map may have a companion ``NAME_std``, its standard error."""
+"""Name of a map -> (unit, long name). Every map may have a companion ``NAME_std``, its standard error, but for those
+``WITHOUT_STD``."""
+
+WITHOUT_STD = ("confidence", "support", "identified")
+IDENTIFIED: dict[str, int] = {
+    name: 1 << bit
+    for bit, name in enumerate(("depth", "normals", "translation", "rotation", "acceleration", "brightness", "flow"))
+}
+"""Group of parameters -> its bit in the map ``identified`` (uint8)."""
 
 MOTION_NAMES = tuple(f"{q}_{a}" for q in ("velocity", "rotation", "acceleration") for a in "xyz")
 """Maps of the unknowns (N, Ω, A)."""
@@ -63,10 +76,23 @@ def quantity(name: str) -> tuple[str, str]:
     Raises KeyError, naming the known ones, for a name that is no map.
     """
     base = name.removesuffix("_std")
-    if base not in QUANTITIES:
-        raise KeyError(f"no map is called {name!r}; known: {', '.join(QUANTITIES)}, each also with _std")
+    if base not in QUANTITIES or (base != name and base in WITHOUT_STD):
+        uncertain = ", ".join(known for known in QUANTITIES if known not in WITHOUT_STD)
+        raise KeyError(f"no map is called {name!r}; known: {uncertain}, each also with _std; {', '.join(WITHOUT_STD)}")
     unit, long_name = QUANTITIES[base]
     return unit, long_name if base == name else f"standard error of the {long_name}"
+
+
+def empty_map(name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    """The map ``name`` or ``"status"`` without a value anywhere; ``identified`` and the status are uint8."""
+    if name == "status":
+        return np.full(shape, Status.NOT_COMPUTED, np.uint8)
+    return np.zeros(shape, np.uint8) if name == "identified" else np.full(shape, np.nan, np.float32)
+
+
+def with_std(names: Iterable[str]) -> tuple[str, ...]:
+    """The maps and their standard errors."""
+    return tuple(n for base in names for n in (base, *([] if base in WITHOUT_STD else [f"{base}_std"])))
 
 
 def map_attributes(name: str) -> dict[str, Any]:
@@ -79,7 +105,10 @@ def map_attributes(name: str) -> dict[str, Any]:
             "comment": "; ".join(f"{code.name.lower()}: {ADVICE[code]}" for code in Status),
         }
     unit, long_name = quantity(name)
-    return {"units": unit, "long_name": long_name}
+    found: dict[str, Any] = {"units": unit, "long_name": long_name}
+    if name == "identified":
+        found |= {"flag_masks": list(IDENTIFIED.values()), "flag_meanings": " ".join(IDENTIFIED)}
+    return found
 
 
 def status_counts(status: NDArray[np.uint8]) -> dict[str, int]:
@@ -95,7 +124,8 @@ def status_counts(status: NDArray[np.uint8]) -> dict[str, int]:
 class Field(Mapping[str, NDArray[np.float32]]):
     """Maps of one frame; ``field["depth"]`` is the map, iteration gives the names.
 
-    ``maps``: name -> float32 ``[y, x]``, names and units as in ``QUANTITIES``, standard errors as ``NAME_std``;
+    ``maps``: name -> float32 ``[y, x]``, names and units as in ``QUANTITIES``, standard errors as ``NAME_std``, the
+    bits of ``IDENTIFIED`` as uint8;
     ``status``: uint8 ``[y, x]``, codes of ``Status``; ``y``, ``x``: int64 pixel coordinates of rows and columns;
     ``frame``: index of the reference frame; ``attrs``: how the field was made (configuration, device, timings).
     Raises ValueError when shapes disagree and KeyError for a name that is no map.

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from leafflow_ti.capture import Capture
 from leafflow_ti.engines import Engine, keep
-from leafflow_ti.field import MOTION_NAMES
+from leafflow_ti.field import MOTION_NAMES, empty_map, with_std
 from leafflow_ti.growth import DIFFERENCES, INPUTS, growth_maps
+from leafflow_ti.identify import settle
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
 from leafflow_ti.reading import Box, Reader
@@ -30,7 +31,7 @@ from leafflow_ti.stages.tensor import Band
 from leafflow_ti.status import HAS_VALUE, Status
 from leafflow_ti.trace import Trace, active, span
 
-Maps = dict[str, NDArray[np.float32]]
+Maps = dict[str, NDArray[Any]]
 _NO_IMAGES: NDArray[Any] = np.empty((0, 0, 0, 0), np.float32)
 
 
@@ -67,8 +68,9 @@ class Pipeline:
         self._y, self._x = (_widened(r, n, plan.margin) for r, n in ((plan.y, capture.height), (plan.x, capture.width)))
         self._rows = self._measurable("y", self._y, capture.height, 1)
         self._cols = self._measurable("x", self._x, capture.width, 0)
-        inputs = (*(INPUTS if plan.differences else ()), *(PARAMETERS if plan.refine else ()))
-        self._names = tuple(dict.fromkeys((*(n for n in plan.names if not n.startswith("growth")), *inputs)))
+        # What a map's user is told depends on the standard errors of others, so all are there.
+        wanted = with_std(n for n in (*plan.quantities, *(PARAMETERS if plan.refine else ())) if n != "growth_rate")
+        self._names = tuple(dict.fromkeys((*wanted, *(INPUTS if plan.differences else ()))))
         self.effort = Effort()
         """Of the refinement in all units so far."""
         self._measured = {*plan.measured, *(INPUTS if plan.differences else ())}
@@ -253,7 +255,7 @@ class Pipeline:
         y, x = self._y[whole], self._x
         shape = (len(y), len(x))
         codes = np.full(shape, Status.BORDER, np.uint8)
-        framed = {name: np.full(shape, np.nan, np.float32) for name in self._names}
+        framed: Maps = {name: empty_map(name, shape) for name in self._names}
         if stay is not None and status is not None:
             codes[stay.place] = status
         if self._reader.mask is not None:
@@ -261,7 +263,7 @@ class Pipeline:
         if stay is not None:
             empty = ~np.isin(codes[stay.place], HAS_VALUE)
             for name, values in maps.items():
-                values[empty] = np.nan
+                values[empty] = empty_map(name, ())
                 framed[name][stay.place] = values
         if plan.differences:
             geometry, sampling = plan.geometry, plan.problem.sampling
@@ -270,6 +272,7 @@ class Pipeline:
         if stay is not None and stay.engine.refine and plan.refine:
             place = Place(y, x, (stay.wide.y, stay.wide.x), plan.geometry)
             self.effort += refine_maps(stay.engine.refine, plan.refine, framed, codes, place)
+            framed["identified"] = settle(framed, codes, plan.limits)
         unit = plan.y[plan.band(band)]
         inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
         return {n: framed[n][inner].copy() for n in plan.names}, codes[inner].copy()
@@ -326,17 +329,16 @@ class Pipeline:
         maps = {}
         for name in self._names:
             base = name.removesuffix("_std")
-            if base not in self._measured:
+            if base not in self._measured or name == "identified":
                 continue
             if name in sample.maps:
                 maps[name] = sample.maps[name][centre].astype(np.float32)
             else:
                 maps[name] = planes[_plane_of(base) + (Output.STD if name != base else 0)].astype(np.float32)
-        has_value = np.isin(status, HAS_VALUE)
-        for values in maps.values():
-            # A degenerate window can defeat the arithmetic: no NaN without a status that says so.
-            status[has_value & ~np.isfinite(values)] = Status.NOT_CONVERGED
-        return maps, status
+        found = settle(maps, status, self.plan.limits)
+        # Texture in all directions, and nothing determined: the window is too small, or degenerate.
+        status[(status == Status.OK) & (found == 0)] = Status.NOT_CONVERGED
+        return {**maps, "identified": found}, status
 
 
 def _plane_of(name: str) -> int:

@@ -1,7 +1,7 @@
 """The plan of a run, a pure value: what is computed, from which windows, in which units, with how much memory.
 
 It is what ``--dry-run`` prints and what the pipeline executes. Making it reads grey values only to find a preshift, and
-for range flow the noise of one image.
+of one image for its noise.
 """
 
 from __future__ import annotations
@@ -13,11 +13,14 @@ from leafflow_ti.bands import READ_AHEAD, Demand, choose_bands, usable_memory
 from leafflow_ti.capture import DEFAULT_CACHE_BYTES, ArrayCapture, Capture, Geometry, find_preshift
 from leafflow_ti.config import RunConfig, resolve
 from leafflow_ti.errors import ConfigError
-from leafflow_ti.field import MOTION_NAMES, QUANTITIES
+from leafflow_ti.field import MOTION_NAMES, QUANTITIES, with_std
+from leafflow_ti.identify import Limits
 from leafflow_ti.model_plan import cameras_read, check_model, fitted_motion, model_problem, sampling_of, static
 from leafflow_ti.models import MODELS, TensorLayout
+from leafflow_ti.noise import noise_level
 from leafflow_ti.range_plan import RangePlan, range_problem
 from leafflow_ti.refine_plan import Refinement, plan_refinement
+from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, Problem
 
 
@@ -54,6 +57,8 @@ class Plan:
     """Frames that are read before they are needed, while the device computes."""
     cache_bytes: int
     """Of these bytes, those of decoded images: kept where several bands need them and all of them fit, else 0."""
+    noise: float = 0.0
+    """Standard deviation of the noise of the (prefiltered) images of the reference camera."""
     ranges: RangePlan | None = None
     refine: Refinement | None = None
 
@@ -76,7 +81,7 @@ class Plan:
     def names(self) -> tuple[str, ...]:
         """Maps that the run writes, standard errors included."""
         kept = self.config.output.arrays
-        available = tuple(n for base in self.quantities for n in (base, f"{base}_std"))
+        available = with_std(self.quantities)
         if kept is None:
             return available
         for name in kept:
@@ -105,14 +110,25 @@ class Plan:
         names += self.ranges.quantities if self.ranges else ()
         names += MOTION_NAMES[: problem.unknowns]
         if "t" in problem.columns.solutions and not self.ranges:
-            names += ["flow_x", "flow_y"]
+            names += ["flow_x", "flow_y", "normal_flow_x", "normal_flow_y"]
         if problem.columns.index("i") is not None:
             names += [f"brightness_{a}" for a in problem.camera_axes]
         names += [BRIGHTNESS_MAPS[o] for o in problem.brightness]
         names += [WORLD_MAPS[o] for o in problem.world_brightness]
         if "depth" in names and problem.unknowns >= 3:
             names.append("growth_rate")
-        return tuple(names)
+        names.append("confidence")
+        names += ["support"] if ESTIMATORS[problem.estimator].robust else []
+        return (*names, "identified")
+
+    @property
+    def limits(self) -> Limits:
+        """Standard errors above which a parameter has no value."""
+        sampling, axes = self.problem.sampling, (self.ranges.depth if self.ranges else self.problem)
+        along = axes.camera_axes[:1] if axes else ()
+        baseline = self.geometry.baseline_mm[0 if along == ("sx",) else 1] if along else 0.0
+        radius = (sampling.x.moment(2) + sampling.y.moment(2)) ** 0.5
+        return Limits(self.geometry.f_px, radius, abs(self.geometry.f_px * baseline))
 
     @property
     def differences(self) -> bool:
@@ -175,10 +191,12 @@ class Plan:
             lines.append(self.refine.describe())
         pixels = len(self.frames) * len(self.y) * len(self.x)
         limit = self.config.plan.max_memory
-        filters = self.config.filters
+        filters, known = self.config.filters, self.config.model.noise != "auto"
+        unit = "of the grey value" if filters.prefilter == "homomorphic" else "grey values"
         if filters.prefilter != "none":
             lines.append(f"prefilter   {filters.prefilter}, sigma {filters.sigma_pre:g} px")
         lines += [
+            f"noise       {self.noise:.3g} {unit}, {'given' if known else 'estimated'}",
             f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
             f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
             f"{self.preshift[0]},{self.preshift[1]} px per step",
@@ -214,17 +232,19 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
             "refinement (--refine 3)"
         )
     motion = fitted_motion(config, name)
-    preshift, ranges = (0, 0), None
+    preshift, ranges, noise = (0, 0), None, noise_level(capture, config)
     if model.ranges:
-        own = None if config.range_flow.depth else model_problem(capture, static(config), "depth", None)
+        depth = None if config.range_flow.depth else model_problem(capture, static(config), "depth", None)
+        own = replace(depth, noise=noise) if depth else None
         preshift = _preshift(capture, config) if own else (0, 0)
         alone = sampling_of(capture, config, "reference", True)
         frames = _frames(capture, config, alone.t.radius, True)
-        problem, ranges = range_problem(capture, config, alone, frames, own, preshift)
+        problem, ranges = range_problem(capture, config, alone, frames, own, preshift, noise)
     else:
         problem = model_problem(capture, config, name, motion)
         frames = _frames(capture, config, problem.sampling.t.radius, model.time)
         preshift = _preshift(capture, config) if problem.camera_axes else (0, 0)
+    problem = replace(problem, noise=noise)
     layout = TensorLayout.of(problem.columns)
     x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
     if x1 > capture.width or y1 > capture.height:
@@ -244,7 +264,7 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     )
     plan = Plan(
         config, name, problem, layout, _geometry(capture),
-        cameras, preshift, frames, y, x, len(y), 0, 0, 0, ranges, refine,
+        cameras, preshift, frames, y, x, len(y), 0, 0, 0, noise, ranges, refine,
     )  # fmt: skip
     depths = (0,) if isinstance(capture, ArrayCapture) else range(READ_AHEAD, -1, -1)
     demand = Demand(config, problem, layout, ranges, refine, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))

@@ -44,9 +44,6 @@ STACK = ("i", "z", "gx", "gy")
 FINEST_RANGE = 1e-5
 """Least noise of the range, relative to its distance: what is finer weighs no more than this."""
 
-LEAST_NOISE = 1e-6
-"""Least noise of the images, relative to their largest grey value."""
-
 
 def images(constraint: str) -> tuple[str, ...]:
     """The images of one frame that a constraint needs; intensity and range always."""
@@ -135,21 +132,3 @@ def factors(
 def smoothed_samples(x: AxisSampling, y: AxisSampling) -> float:
     """White samples that a window mean has the weight of: ``1 / Σ w²``."""
     return float(1.0 / np.prod([np.sum(np.array(axis.weights) ** 2) for axis in (x, y)]))
-
-
-def white_noise(image: NDArray[Any], rounded: bool) -> float:
-    """Standard deviation of the white noise of an image [y, x]: fourth differences along both axes, a robust median.
-
-    What is smoother than some five pixels does not count; flat parts, whose rounding hides the noise, neither. Images
-    ``rounded`` to integers have at least the noise of that, others ``LEAST_NOISE`` of their largest value.
-    """
-    values = np.asarray(image, np.float64)
-    finite = np.isfinite(values)
-    largest = float(np.max(np.abs(values[finite]), initial=0.0))
-    least = 12**-0.5 if rounded else LEAST_NOISE * largest
-    difference = np.abs(np.diff(np.diff(values, 4, axis=0), 4, axis=1))
-    difference = difference[np.isfinite(difference) & (difference > 0)]
-    if not difference.size:
-        return least or 1.0
-    norm = float(np.sum(np.array([1, -4, 6, -4, 1]) ** 2))  # along each of the two axes
-    return max(float(np.median(difference)) / (0.6745 * norm), least)

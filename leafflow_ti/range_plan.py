@@ -11,7 +11,7 @@ from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.model_plan import weighing
 from leafflow_ti.models import TensorLayout
-from leafflow_ti.range_flow import columns, images, smoothed_samples, white_noise, window_radius
+from leafflow_ti.range_flow import columns, images, smoothed_samples, window_radius
 from leafflow_ti.range_source import GivenRange, open_range
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.problem import Problem
@@ -73,13 +73,16 @@ def range_problem(
     frames: tuple[int, ...],
     depth: Problem | None,
     preshift: tuple[int, int],
+    noise: float,
 ) -> tuple[Problem, RangePlan]:
-    """Range flow on ``frames`` with one camera's ``sampling``; ``depth``: our own range, None where it is given.
+    """Range flow on ``frames`` with one camera's ``sampling``; ``depth``: our own range, None where it is given;
+    ``noise`` of the images, in grey values.
 
-    Reads one image, for its noise, and one given range map. Raises ConfigError for choices that exclude each other,
+    Reads one given range map. Raises ConfigError for choices that exclude each other,
     InputError for range maps that do not fit.
     """
     chosen, model = config.range_flow, config.model
+    noise = noise or 1.0  # without any, the range is weighted as if the images had some
     if model.rows != "auto":
         raise ConfigError(f"rows '{model.rows}': model 'range-flow' has no rows to choose from, leave it out")
     if chosen.constraint != "taylor" and model.brightness_terms != "none":
@@ -94,10 +97,6 @@ def range_problem(
     geometry = capture.geometry
     if geometry is None:
         raise ConfigError("model 'range-flow' needs the focal length: add [camera] focal_length_px to the capture.toml")
-    image = capture.read(capture.n_frames // 2, *capture.reference, 0, capture.height, 0, capture.width, np.float64)
-    noise = white_noise(image, capture.dtype.kind in "bui")
-    if config.filters.prefilter == "homomorphic":
-        noise /= float(np.median(image[image > 0])) if (image > 0).any() else 1.0  # that of the logarithm
     given = None
     if depth is None:
         assert chosen.depth is not None

@@ -23,7 +23,8 @@ from leafflow_ti.capture.pattern import Pattern
 from leafflow_ti.config import WindowSection
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import gaussian_weights
-from leafflow_ti.range_flow import FINEST_RANGE, white_noise
+from leafflow_ti.noise import white_noise
+from leafflow_ti.range_flow import FINEST_RANGE
 from leafflow_ti.results import ResultStore
 
 Array = NDArray[Any]

@@ -42,13 +42,14 @@ class Place:
 
 
 def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place) -> Effort:
-    """Refine every pixel whose status is ok, in place of ``maps`` [rows, cols] and ``status``; returns what it took.
+    """Refine every pixel whose status is ok and whose depth is known, in place of ``maps`` [rows, cols] and ``status``;
+    returns what it took.
 
     Texture in one direction alone (aperture) does not determine the motion, and the noise in the texture's gradient
     would pass for what does: such pixels keep what the model says. ``maps`` hold what the model gives; those that only
     the refinement gives are there, too, and not looked at.
     """
-    rows, cols = np.nonzero(status == Status.OK)
+    rows, cols = np.nonzero((status == Status.OK) & np.isfinite(maps["depth"]))
     if not rows.size:
         return Effort()
     start = np.zeros((rows.size, _GROWTH + 3))

@@ -26,8 +26,7 @@ from zarr.codecs import ZstdCodec
 from zarr.errors import NodeNotFoundError
 
 from leafflow_ti.errors import InputError, RunError, UsageError
-from leafflow_ti.field import QUANTITIES, Field, map_attributes
-from leafflow_ti.status import Status
+from leafflow_ti.field import QUANTITIES, Field, empty_map, map_attributes, with_std
 
 WRITERS = 16
 """Chunks of a unit that are written together: the disk forces them out at once, and while kernels run, which hold the
@@ -106,8 +105,8 @@ class ResultStore:
                         name,
                         shape=shape,
                         chunks=chunk,
-                        dtype="uint8" if name == "status" else "float32",
-                        fill_value=int(Status.NOT_COMPUTED) if name == "status" else float("nan"),
+                        dtype=empty_map(name, ()).dtype,
+                        fill_value=empty_map(name, ()).item(),
                         dimension_names=list(coordinates),
                         attributes=attributes,
                         compressors=_COMPRESSOR,
@@ -136,7 +135,7 @@ class ResultStore:
             )
         arrays = dict(group.arrays())
         t, y, x = (np.asarray(arrays[axis][...], np.int64) for axis in ("t", "y", "x"))
-        names = tuple(n for base in QUANTITIES for n in (base, f"{base}_std") if n in arrays)
+        names = tuple(n for n in with_std(QUANTITIES) if n in arrays)
         return cls(path, tuple(t.tolist()), y, x, names, arrays["status"].chunks[1], group, arrays)
 
     @property

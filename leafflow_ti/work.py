@@ -20,10 +20,14 @@ from typing import Any
 import numpy as np
 
 from leafflow_ti.ceilings import Ceilings
+from leafflow_ti.kernels.numbers import NARROW, Stage, Weights
 from leafflow_ti.models import AXES, ColumnSet, TensorLayout
 from leafflow_ti.plan import Plan
 from leafflow_ti.sampling import AxisSampling, Sampling, cross_noise
+from leafflow_ti.stages.cells import Cells
+from leafflow_ti.stages.channels import Request
 from leafflow_ti.stages.estimate_tables import GUARDED
+from leafflow_ti.stages.estimators import ESTIMATORS, Move
 from leafflow_ti.stages.problem import Problem
 
 Key = tuple[Any, ...]
@@ -77,13 +81,8 @@ def rate(stage: str, work: Work, seconds: float, ceilings: Ceilings, storage: st
     return Rate(gflops, gbytes, gflops / peak, gbytes / ceilings.gbytes)
 
 
-@dataclass(frozen=True)
-class _Data:
+class _Data(Request):
     """One data vector: its columns on their sampling."""
-
-    columns: ColumnSet
-    layout: TensorLayout
-    sampling: Sampling
 
     @property
     def samples(self) -> int:
@@ -117,9 +116,7 @@ def _count(
 ) -> dict[str, Work]:
     itemsize = 4 if precision == "f32" else 8
     own = problem.own_flows
-    vectors = [_Data(problem.columns, layout, problem.sampling)]
-    if own:
-        vectors += len(own.steps) * [_Data(own.columns, TensorLayout.of(own.columns), own.sampling)]
+    vectors = [_Data(r.columns, r.layout, r.sampling, r.step) for r in problem.requests(layout)]
     filters = _filter_flops(problem) + sum(_product_flops(data, block) for data in vectors)
     kept = sum(_kept(data, block) for data in vectors)
     images = _images(problem.columns, problem.sampling, len(own.steps) + 1 if own else 0)
@@ -131,7 +128,7 @@ def _count(
             sum(_window_flops(data, stride, block) for data in vectors),
             itemsize * (n_t * kept * stride**2 + entries),
         ),
-        "solve": Work(sum(_solve_flops(problem, data.columns) for data in vectors), itemsize * entries),
+        "solve": Work(sum(_solve_flops(problem, data) for data in vectors), itemsize * entries),
         "fit": Work(_fit_flops(problem, differences), itemsize * (n_maps + 1)),
     }
 
@@ -253,24 +250,56 @@ def _jacobi(n: int, sweeps: int) -> float:
     return sweeps * n * (n - 1) / 2 * (18 * n + 15)
 
 
-def _solve_flops(problem: Problem, columns: ColumnSet) -> float:
-    """Null space, parameters, residuals and covariances of one data vector."""
-    n, flow, k = columns.n, columns.n_flow, columns.n_time_like
-    flops = n * (n + 1) + cholesky_flops(n) + flow * flow * k  # scaling, factor, least-squares start
-    if problem.estimator != "ols" and problem.solver == "fast":
-        m = GUARDED[k]
-        orthogonalise = m * (m - 1) / 2 * 4 * n + m * 3 * n
-        flops += problem.iterations * (substitution_flops(n, m) + orthogonalise)
-        flops += n * n * m + m * (m + 1) * n + _jacobi(m, RITZ_SWEEPS) + 4 * n * m * m
-        flops += k * (n * n + 4 * n)  # residual against the gap
-    elif problem.estimator != "ols":
-        flops += _jacobi(n, FULL_SWEEPS)
-    flops += 2 * flow * k * k + k * (n * n + 3 * n)
+def _solve_flops(problem: Problem, request: Request) -> float:
+    """Null space, parameters, residuals and covariances of one data vector.
+
+    Of robust estimators that take up failed pixels alone, the plain solution: how many fail is not known beforehand.
+    """
+    columns, estimator = request.columns, ESTIMATORS[problem.estimator]
+    flow = columns.n_flow
+    plain = estimator.robust and problem.robust == "failed"
+    moves = [move for move in estimator.moves(problem.solver) if not (plain and move.anew)]
+    fast = any(move.stage == Stage.INVERSE_ITERATION for move in moves)
+    cells = Cells(request) if estimator.weighs else None
+    wanted = [move for move in moves if move.stage != Stage.JACOBI or not fast]
+    flops = sum((_move_flops(move, problem, columns, cells) for move in wanted), 0.0)
     flops += flow * (flow + 1) + cholesky_flops(flow)  # J_ff without its noise
     for rows in _rows(problem, columns):
         flops += flow * (flow + 1) / 2 + substitution_flops(flow, rows)
         flops += 2 * flow * flow * rows + rows * (rows + 1) * flow
     return flops
+
+
+def _move_flops(move: Move, problem: Problem, columns: ColumnSet, cells: Cells | None) -> float:
+    """One move of an estimator; those not named cost next to nothing."""
+    n, flow, k = columns.n, columns.n_flow, columns.n_time_like
+    m = GUARDED[k]
+    orthogonalise = m * (m - 1) / 2 * 4 * n + m * 3 * n
+    ritz = n * n * m + m * (m + 1) * n + _jacobi(m, RITZ_SWEEPS) + 4 * n * m * m + k * (n * n + 4 * n)
+    flops: dict[Stage, float] = {
+        Stage.SCALE: n * (n + 1),
+        Stage.FACTORISE: cholesky_flops(n),
+        Stage.LEAST_SQUARES: flow * flow * k,
+        Stage.INVERSE_ITERATION: problem.iterations * (substitution_flops(n, m) + orthogonalise) + ritz,
+        Stage.JACOBI: _jacobi(n, FULL_SWEEPS),
+        Stage.FUNDAMENTAL: _jacobi(n, FULL_SWEEPS),
+        Stage.PARAMETERS: 2 * flow * k * k,
+        Stage.RESIDUALS: k * (n * n + 3 * n),
+        Stage.WHITEN: cholesky_flops(n) + 2 * n**3,
+        Stage.UNWHITEN: n * n * k,
+        Stage.RELAX: move.which * k * flow * 3 * n,
+        Stage.REWEIGHT: _reweight_flops(move, cells) if cells else 0.0,
+    }
+    return flops.get(move.stage, 0.0)
+
+
+def _reweight_flops(move: Move, cells: Cells) -> float:
+    """Every cell's entries, its residual unless weights are of the noise alone, and the sums."""
+    sampling = cells.request.sampling
+    number = len(sampling.x.blocked.weights) * len(sampling.y.blocked.weights)
+    entries, terms, monomials = len(cells.entries), sum(map(len, cells.entries)), len(cells.monomials)
+    residual = 0 if move.which % NARROW == Weights.NOISE else 2 * entries
+    return float(number * (2 * terms + residual + 2 * entries + 7 * monomials))
 
 
 def _rows(problem: Problem, columns: ColumnSet) -> Iterable[int]:

@@ -67,6 +67,11 @@ CASES = (
     Case("sequence", "sequence:run_sequence", "30 frames from files against 12: time per frame, peak memory"),
     Case("large", "sequence:run_large", "1600x1200 pixels by 9 cameras within a memory cap"),
     Case("scene-flow-ratio", "ratio:run", "affine-scene-flow against affine-4d on the same capture"),
+    Case(
+        "estimator-cells",
+        "estimator_cells:run",
+        "weighted estimators: what it costs that a cell's samples share a weight",
+    ),
     Case("refine-cube", "refinement.cube:run_cube", "exact refinement of the rotating cube, against the affine start"),
     Case("refine-light", "refinement.cube:run_light", "the same under a fixed spot, and under one on the camera"),
     Case("refine-worse", "refinement.cube:run_worse", "share of the pixels of all scenes that refinement made worse"),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from reference import chain
+from reference import estimators as weighted
 
 from leafflow_ti.field import MOTION_NAMES
 from leafflow_ti.filters import filter_set
@@ -19,6 +20,7 @@ from leafflow_ti.models import BRIGHTNESS, MODELS, OWN_FLOW, ColumnSet, TensorLa
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import EstimateStage, View
+from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, Request, TensorStage
 from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
@@ -164,14 +166,19 @@ class Bench:
     def layout(self) -> TensorLayout:
         return TensorLayout.of(self.columns)
 
-    @cached_property
+    @property
     def _tensor(self) -> tuple[TensorStage, Any]:
+        return self._pushed(False)
+
+    @functools.cache  # noqa: B019 - a bench lives as long as the session
+    def _pushed(self, weighed: bool) -> tuple[TensorStage, Any]:
+        """The tensor stage behind the last frame, and its tensors; ``weighed``: with what windows are weighted by."""
         own: list[Request] = []
         if self.model and MODELS[self.model].own_flows:
             sampling, columns = self.own_columns
             layout = TensorLayout.of(columns)
             own = [Request(columns, layout, sampling, (y, x)) for x, y in self.steps]
-        stage = TensorStage(self.device, self.columns, self.layout, self.sampling, self.band, own)
+        stage = TensorStage(self.device, self.columns, self.layout, self.sampling, self.band, own, weighed=weighed)
         valid = np.ones((len(self.images), *self.images.shape[3:]), bool) if self.valid is None else self.valid
         found = [stage.push(block, ok) for block, ok in zip(self.images, valid, strict=True)]
         assert all(tensor is None for tensor in found[:-1])
@@ -196,18 +203,15 @@ class Bench:
         return self.images[:, y + rows // 2, x + cols // 2][:, None, None]
 
     @functools.cache  # noqa: B019 - a bench lives as long as the session
-    def own_reference(self, row: int, col: int) -> list[tuple[np.ndarray, float]]:
-        """J and ρ of every camera's own flow at one output pixel by the naive twin."""
-        found = []
-        (x, y), (sampling, columns) = self.position(row, col), self.own_columns
-        for step in self.steps:
-            # A block with all that one window needs, around the pixel.
-            around = self.own_images(*step)[..., y - self.band.halo_y : y + self.band.halo_y + 1, :]
-            around = around[..., x - self.band.halo_x : x + self.band.halo_x + 1]
-            at = (self.band.halo_x, self.band.halo_y)
-            J = chain.structure_tensor(around, sampling, columns, [at])[0]
-            found.append((J, chain.texture_smoothness(around, sampling, *at)))
-        return found
+    def own_reference(self, row: int, col: int, weighed: bool) -> list[tuple[Any, float]]:
+        """J or, where windows are weighted, the cells of every camera's own flow at one output pixel; and ρ."""
+        x, y = self.position(row, col)
+        # A block with all that one window needs, around the pixel.
+        part = np.s_[
+            ..., y - self.band.halo_y : y + self.band.halo_y + 1, x - self.band.halo_x : x + self.band.halo_x + 1
+        ]
+        at = (self.band.halo_x, self.band.halo_y)
+        return [weighted.window(self.own_images(*s)[part], *self.own_columns, at, None, weighed) for s in self.steps]
 
     @cached_property
     def planes(self) -> np.ndarray:
@@ -228,11 +232,24 @@ class Bench:
         return self.band.halo_x + self.band.stride * col, self.band.halo_y + self.band.stride * row
 
     @functools.cache  # noqa: B019 - a bench lives as long as the session
-    def reference(self, row: int, col: int) -> tuple[np.ndarray, float]:
-        """J [N, N] and ρ of one output pixel by the naive twin."""
-        at = self.position(row, col)
-        J = chain.structure_tensor(self.images, self.sampling, self.columns, [at], self.valid)[0]
-        return J, chain.texture_smoothness(self.images, self.sampling, *at)
+    def reference(self, row: int, col: int, weighed: bool = False) -> tuple[Any, float]:
+        """J [N, N] or, where windows are weighted, the cells of one output pixel by the naive twin; and ρ."""
+        return weighted.window(self.images, self.sampling, self.columns, self.position(row, col), self.valid, weighed)
+
+    def solved(self, row: int, col: int, problem: Problem) -> tuple[chain.Solved, list[chain.Solved]]:
+        """What the naive twin finds at one output pixel, and from every camera's own flow."""
+
+        def solve(J: Any, rho: float, sampling: Sampling, columns: ColumnSet) -> chain.Solved:
+            if weighed:
+                return weighted.estimate(J, problem).solved(rho)
+            return chain.Solved.of(J, rho, columns, sampling, problem.estimator, problem.scale)
+
+        weighed = ESTIMATORS[problem.estimator].weighs
+        own = self.own_reference(row, col, weighed) if problem.own_flows else []
+        return (
+            solve(*self.reference(row, col, weighed), self.sampling, self.columns),
+            [solve(*one, *self.own_columns) for one in own],
+        )
 
     @property
     def scene(self) -> PlaneScene:
@@ -257,7 +274,8 @@ class Bench:
         """
         from leafflow_ti.kernels.workspace import Region
 
-        tensors = self._tensor[1]
+        stage, tensors = self._pushed(ESTIMATORS[options.get("estimator", Problem.estimator)].weighs)
+        sources = stage.sources
         apart = bool(options.pop("apart", True))
         if motion is not None:
             model = MODELS[self.model]
@@ -270,14 +288,17 @@ class Bench:
                 growth = bool(options.pop("growth", "x" in own))
                 without = options.pop("without", ())
                 kept = [i for i in range(len(self.steps)) if i not in without]
-                tensors = self._chosen(kept, options.pop("lost", ()))
+                lost = options.pop("lost", ())
+                if lost or without:
+                    assert not sources
+                    tensors = self._chosen(kept, lost)
                 options["own_flows"] = OwnFlows(
                     columns, sampling, tuple(self.steps[i] for i in kept), own, unknowns, model.reference_rows, growth
                 )
         problem = Problem(self.columns, self.sampling, **options)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("leafflow_ti.stages.estimate.BATCH_BYTES", 64 << 20)  # one batch: its workspace is looked at
-            stage = EstimateStage(self.device, problem, self.layout, self.view, apart=apart)
+            stage = EstimateStage(self.device, problem, self.layout, self.view, apart=apart, sources=sources)
         planes = np.array(stage(tensors))
         k, flow = self.columns.n_time_like, self.columns.n_flow
         if not apart:
@@ -287,7 +308,10 @@ class Bench:
         return Estimated(problem, planes, parameters.reshape(*parameters.shape[:2], k, flow), variance)
 
     def _chosen(self, kept: Sequence[int], lost: Sequence[int]) -> Any:
-        """The grid's tensor and those of the ``kept`` own flows; of these, ``lost`` ones are all zero."""
+        """The grid's tensor and those of the ``kept`` own flows; of these, ``lost`` ones are all zero.
+
+        Without what windows are weighted by: for estimators that do not.
+        """
         stage, tensors = self._tensor
         own = TensorLayout.of(self.own_columns[1])
         sizes = [len(layout.entries) + EXTRA_PLANES for layout in (self.layout, *[own] * len(self.steps))]

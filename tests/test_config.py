@@ -151,7 +151,7 @@ def test_configuration_is_frozen() -> None:
         ("refine.thin=0", ["integer >= 1"]),
         ("refine=3", ["refine (--set)", "refine.steps"]),
         ("model.deformation=stretch", ["'growth' or 'strain'"]),
-        ("model.estimator=best", ["model.estimator = 'best'", "'ols', 'tls' or 'tls-equilibrated'"]),
+        ("model.estimator=best", ["model.estimator = 'best'", "'ols', 'tls', 'tls-equilibrated'", "'robust-tls'"]),
         ("model.rows=2d+b5+b5", ["2d+b5+b5", "+b5, +as, +at"]),
         ("filters.taps=9", ["filters.taps = '9'", "'3x1x1', '3', '5' or '7'"]),
         ("plan.max_memory=lots", ["plan.max_memory = 'lots'", "8G"]),

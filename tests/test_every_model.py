@@ -14,8 +14,9 @@ from test_cli import call
 import leafflow_ti as lf
 from leafflow_ti import api
 from leafflow_ti.config import load_config
-from leafflow_ti.models import MODELS
+from leafflow_ti.models import MODELS, ColumnSet
 from leafflow_ti.results import ResultStore
+from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.estimate import View
 from leafflow_ti.status import Status
 
@@ -147,18 +148,22 @@ def assert_equal_to_twin(folder: Path, choice: dict[str, object], maps: dict[str
 
     row, col = capture.reference
     block = images(around(row, sampling.sy.radius), around(col, sampling.sx.radius))
-    J = chain.structure_tensor(block, sampling, problem.columns, [(half, half)])[0]
-    rho = chain.texture_smoothness(block, sampling, half, half)
+
+    def solved(one: np.ndarray, columns: ColumnSet, sampling: Sampling) -> chain.Solved:
+        J = chain.structure_tensor(one, sampling, columns, [(half, half)])[0]
+        rho = chain.texture_smoothness(one, sampling, half, half)
+        return chain.Solved.of(J, rho, columns, sampling, problem.estimator)
+
     own = []
     for step in problem.own_flows.steps if problem.own_flows else ():
         flows = problem.own_flows
         one = images(range(row + step[1], row + step[1] + 1), range(col + step[0], col + step[0] + 1))
-        tensor = chain.structure_tensor(one, flows.sampling, flows.columns, [(half, half)])[0]
-        own.append((tensor, chain.texture_smoothness(one, flows.sampling, half, half)))
+        own.append(solved(one, flows.columns, flows.sampling))
     shift = tuple(float(p) for p in plan.preshift)
     view = View(geometry.f_px, geometry.principal_px, geometry.baseline_mm, shift, x, y, 4, 1, 1, 1)
-    found = patch.measure(J, rho, problem, view, x, y, own)
-    assert {name for name in maps if not name.endswith("_std")} - {"growth_rate"} == set(found)
+    found = patch.measure(solved(block, problem.columns, sampling), problem, view, x, y, own)
+    others = {"growth_rate", "normal_flow_x", "normal_flow_y", "confidence", "identified"}
+    assert {name for name in maps if not name.endswith("_std")} - others == set(found)
     for name, (value, std) in found.items():
         # Maps are stored in single precision.
         assert maps[name][1] == pytest.approx(value, rel=1e-6, abs=1e-4 * std), name

@@ -62,16 +62,14 @@ def assert_maps_equal(b, found) -> None:
     limit = tolerance(b.device)
     for pixel in PIXELS:
         assert found.status[pixel] == Status.OK
-        own = b.own_reference(*pixel) if found.problem.own_flows else ()
-        reference = patch.measure(*b.reference(*pixel), found.problem, b.view, *b.position(*pixel), own)
+        solved, own = b.solved(*pixel, found.problem)
+        reference = patch.measure(solved, found.problem, b.view, *b.position(*pixel), own)
         for name, (value, std) in reference.items():
             map_value, map_std = (m[pixel] for m in found.map(name))
             assert abs(map_value - value) <= limit.maps * std, f"{name}: {map_value} is not {value} ± {std}"
             assert map_std == pytest.approx(std, rel=limit.errors), f"standard error of {name}"
         if found.problem.unknowns >= 3:
-            reference = patch.velocity_differences(
-                *b.reference(*pixel), found.problem, b.view, *b.position(*pixel), own
-            )
+            reference = patch.velocity_differences(solved, found.problem, b.view, *b.position(*pixel), own)
             for name, (value, scale) in reference.items():
                 assert abs(found.difference(name)[pixel] - value) <= 2 * limit.errors * scale, name
 

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 import leafflow_ti as lf
 from leafflow_ti.capture import Geometry, capture_from_array
+from leafflow_ti.field import IDENTIFIED
 from leafflow_ti.status import HAS_VALUE, Status
 from leafflow_ti.synthetic.plane import PlaneScene, render
 
@@ -54,13 +55,23 @@ def statuses(field: lf.Field) -> set[Status]:
 
 
 def assert_values_follow_status(field: lf.Field) -> None:
+    """Values are where the status says so, but for groups that are not identified."""
     empty = ~np.isin(field.status, HAS_VALUE)
     around = np.pad(empty, 1, constant_values=True)
     alone = (around[:-2, 1:-1] & around[2:, 1:-1]) | (around[1:-1, :-2] & around[1:-1, 2:])
-    for name, values in field.items():
+    assert not field["identified"][empty].any()
+    for name in (n for n in field if n != "identified"):
         # The area of a surface element takes a neighbour along x and one along y.
         none = empty | alone if name.startswith("growth_rate") else empty
-        np.testing.assert_array_equal(np.isnan(values), none, err_msg=name)
+        if name.startswith("normal_flow"):
+            none = field.status != Status.APERTURE
+        unknown = np.isnan(field[name])
+        assert unknown[none].all(), name
+        if f"{name}_std" in field and not name.startswith("growth_rate"):
+            lost = unknown & ~none
+            np.testing.assert_array_equal(np.isinf(field[f"{name}_std"]), lost, err_msg=name)
+        elif not name.startswith("growth_rate"):
+            np.testing.assert_array_equal(unknown, none, err_msg=name)
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
@@ -123,6 +134,9 @@ def test_full_texture_is_ok(images: np.ndarray) -> None:
         field = measure(images, model)
         assert statuses(field) == {Status.OK}
         assert_values_follow_status(field)
+        wanted = ["flow"] if model.startswith("flow") else ["flow", "depth", "normals", "translation"]
+        for group in wanted:
+            assert (field["identified"][field.status == Status.OK] & IDENTIFIED[group]).all(), group
 
 
 def test_preshift_out_of_the_image_is_border(images: np.ndarray) -> None:
@@ -137,11 +151,11 @@ def test_preshift_out_of_the_image_is_border(images: np.ndarray) -> None:
 
 
 def test_pixels_that_are_not_finite_stay_in_their_windows(images: np.ndarray) -> None:
-    whole = measure(images)
+    whole = measure(images, noise=1.0)  # else estimated from the broken image, too
     broken = images.copy()
     broken[3, 0, 2, 20, 30] = np.nan
     broken[2, 0, 2, 21, 34] = np.inf
-    field = measure(broken)
+    field = measure(broken, noise=1.0)
     assert np.argwhere(field.status == Status.NOT_FINITE).tolist() == [[20, 30]]
     assert field.status[21, 34] == Status.OK  # finite at the frame that is measured
     assert_values_follow_status(field)

@@ -21,11 +21,11 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(
         ("capture", "models", "config", "config_values", "geometry", "field", "filters", "sampling", "range_flow"), 3
     ),
-    **dict.fromkeys(("presets", "splines", "refine_plan"), 3),
+    **dict.fromkeys(("presets", "splines", "refine_plan", "noise"), 3),
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
-    **dict.fromkeys(("growth", "refinement"), 5),
+    **dict.fromkeys(("growth", "refinement", "identify"), 5),
     **dict.fromkeys(("bands", "model_plan", "plan", "reading", "engines", "pipeline", "results", "work"), 6),
     **dict.fromkeys(("refinement", "refine_work"), 6),
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),

@@ -77,6 +77,10 @@ Robust = Annotated[
 ]
 Solver = Annotated[str | None, _text("solver", "fast|jacobi", "Null-space solver [fast].")]
 Weighting = Annotated[str | None, _text("weighting", "wls|ls", "3D fit weighted by covariance, or not [wls].")]
+Noise = Annotated[
+    str | None,
+    _text("noise", "auto|GREYS", "Standard deviation of the images' noise [auto: estimated from the middle image]."),
+]
 Window = Annotated[int | None, _text("window", "PIXELS", "Side of the window, odd [65].")]
 Sigma = Annotated[float | None, _text("sigma", "PIXELS", "Gaussian width of the window [19/65 of its side].")]
 Stride = Annotated[
@@ -130,7 +134,7 @@ SETTINGS: dict[str, Any] = {
     "preset": Preset, "model": Model, "motion": Motion, "deformation": Deformation, "rows": Rows,
     "brightness": Brightness, "brightness_terms": BrightnessTerms, "constraint": Constraint, "beta": Beta,
     "depth": Depth, "estimator": Estimator, "scale": Scale, "penalty": Penalty, "robust": Robust, "solver": Solver,
-    "weighting": Weighting, "window": Window, "sigma": Sigma, "stride": Stride, "border": Border,
+    "weighting": Weighting, "noise": Noise, "window": Window, "sigma": Sigma, "stride": Stride, "border": Border,
     "refine": Refine, "refine_window": RefineWindow, "thin": Thin, "taps": Taps, "blur": Blur, "prefilter": Prefilter,
     "sigma_pre": SigmaPre, "frames": Frames, "roi": Roi, "mask": Mask, "preshift": Preshift,
     "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads,

@@ -11,8 +11,9 @@ from types import SimpleNamespace
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
+from leafflow_ti.kernels.identify import identify_functions
 from leafflow_ti.kernels.spec import KernelSpec
-from leafflow_ti.kernels.texture import texture_function
+from leafflow_ti.kernels.texture import texture_functions
 from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Region, Value
 
 
@@ -20,7 +21,7 @@ from leafflow_ti.kernels.workspace import MAX_ROWS, Number, Region, Value
 def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``clean``, then ``row_covariance`` and ``add_camera`` per solution, and ``geometry``."""
     precise, V = spec.precise, spec.element
-    small, smoothness = dense(spec), texture_function(spec)
+    small, texture, identify = dense(spec), texture_functions(spec), identify_functions(spec)
 
     @ti.func
     def clean(
@@ -31,10 +32,7 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
         instead of looking certain."""
         flow = number[p.n + Number.FLOW]
         moments, packed = region(p, number, Region.MOMENTS), region(p, number, Region.CLEAN)
-        variance = region(p, number, Region.VARIANCE)
-        quietest = ws[variance]
-        for j in range(1, number[p.n + Number.SOLUTIONS]):
-            quietest = ti.min(quietest, ws[variance + j * p.stride])
+        quietest = identify.quietest(p, number, ws)
         floor = V(0.0)
         for r in range(flow):
             for c in range(r + 1):
@@ -86,7 +84,8 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
         p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
         out: ti.template(),
     ):  # fmt: skip
-        """Packed covariance of the rows of solution ``which``; keeps ``J_ff^-1 E``."""
+        """Packed covariance of the rows of solution ``which``; keeps ``J_ff^-1 E``. Where the texture does not
+        determine all of them, it says so, and the solution is made anew (see ``identify``)."""
         flow = number[p.n + Number.FLOW]
         n_rows, rows_at = number[p.n + Number.ROWS_S], Number.CAMERA_ROWS + p.which * MAX_ROWS
         target, cov = region(p, number, Region.RESPONSE_S), region(p, number, Region.COV_S)
@@ -110,11 +109,12 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
             ws[own] = ws[own] + ws[moments + number[at + 1] * p.stride] * value[p.v + extra + term]
         response(target, rows_at, n_rows, p, number, value, ws)
         small.symmetric_times(ws, noise, target, product, flow, n_rows, p.stride)
-        factor = smoothness(p, number, ws) * ws[region(p, number, Region.VARIANCE) + p.which * p.stride]
+        factor = texture.smoothness(p, number, ws) * ws[region(p, number, Region.VARIANCE) + p.which * p.stride]
         for r in range(n_rows):
             for c in range(r + 1):
                 one, two = target + r * p.stride, product + c * p.stride
                 ws[cov + tri(r, c) * p.stride] = small.dot(ws, one, n_rows, two, n_rows, flow, p.stride) * factor
+        identify.admit(target, rows_at, n_rows, cov, p, number, value, ws)
 
     @ti.func
     def cross_covariance(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
@@ -124,7 +124,7 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
         one_at, two_at = region(p, number, Region.RESPONSE_S), region(p, number, Region.RESPONSE_T)
         variance = region(p, number, Region.VARIANCE)
         common = ws[variance + p.which * p.stride] * ws[variance + number[p.n + Number.MOTION_SOLUTION] * p.stride]
-        factor = smoothness(p, number, ws) * ti.sqrt(ti.max(common, V(0.0)))
+        factor = texture.smoothness(p, number, ws) * ti.sqrt(ti.max(common, V(0.0)))
         small.clear(ws, cross, rows_s * rows_t, p.stride)
         for term in range(number[p.n + Number.CROSS_TERMS]):
             entry = p.n + Number.CROSS_AB + (p.which * 9 + term) * 3

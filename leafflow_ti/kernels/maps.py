@@ -9,6 +9,7 @@ from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.patch import patch_functions
 from leafflow_ti.kernels.spec import KernelSpec
+from leafflow_ti.kernels.texture import texture_functions
 from leafflow_ti.kernels.workspace import Number, Region, Value
 from leafflow_ti.status import Status
 
@@ -32,17 +33,26 @@ class Output(IntEnum):
     BRIGHTNESS_WORLD_X = 21
     BRIGHTNESS_WORLD_Y = 22
     BRIGHTNESS_WORLD_TT = 23
-    STD = 24
-    DIFFERENCES = 48  # 2 x packed [3]: covariance of the velocity's difference quotients along x and y
-    STATUS = 60
-    PLANES = 61
+    NORMAL_FLOW_X = 24
+    NORMAL_FLOW_Y = 25
+    STD = 26
+    DIFFERENCES = 52  # 2 x packed [3]: covariance of the velocity's difference quotients along x and y
+    STATUS = 64
+    CONFIDENCE = 65
+    SUPPORT = 66
+    PLANES = 67
+
+
+EXPECTED = 10.0
+"""How many times the expected residual leaves no confidence."""
+TINY = 1e-30
 
 
 @functools.cache
 def maps_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``measured`` (all maps but the motion), ``motion``, and ``emit``, which writes them to the planes."""
     real, precise, lanes, V = spec.real, spec.precise, spec.lanes, spec.element
-    patch = patch_functions(spec)
+    patch, texture = patch_functions(spec), texture_functions(spec)
     ok, no_structure, aperture, incoherent = (
         float(s) for s in (Status.OK, Status.NO_STRUCTURE, Status.APERTURE, Status.INCOHERENT)
     )
@@ -54,27 +64,35 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         plane: ti.i32, result: ti.template(), variance: ti.template(), p: ti.template(), target: ti.i32,
         ws: ti.template(),
     ):  # fmt: skip
-        """One map and its standard error."""
+        """One map and its standard error; no number where the variance is none, or negative by rounding."""
         ws[target + plane * p.stride] = result
-        ws[target + (Output.STD + plane) * p.stride] = ti.sqrt(ti.max(variance, V(0.0)))
+        std = ti.select(variance >= V(0.0), ti.sqrt(ti.max(variance, V(0.0))), V(nan))
+        ws[target + (Output.STD + plane) * p.stride] = std
 
     @ti.func
     def classify(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
-        """The first of: border, no structure, incoherent, not converged, aperture, ok."""
-        moments, found = region(p, number, Region.MOMENTS), region(p, number, Region.PARAMETERS)
-        ix, iy = number[p.n + Number.FLOW_ROWS], number[p.n + Number.FLOW_ROWS + 1]
-        xx = ws[moments + number[p.n + Number.LOWER + tri(ix, ix)] * p.stride]
-        xy = ws[moments + number[p.n + Number.LOWER + tri(iy, ix)] * p.stride]
-        yy = ws[moments + number[p.n + Number.LOWER + tri(iy, iy)] * p.stride]
-        extra = moments + number[p.n + Number.EXTRA] * p.stride
+        """The status, the first of: border, no structure, incoherent, not converged, aperture, ok; and the confidence.
+
+        With the noise level known, that much of the residual is no sign of incoherence, up to half of it: the level may
+        be that of a fine texture. The confidence is that of (2.18), ((τ - λ) / (τ + λ))² for residual variances λ < τ,
+        τ being ``EXPECTED`` times what noise and the model's own misfit amount to, times ``(s / (s + e))²`` with s the
+        least energy of the gradient in any direction beyond its noise, and e the energy of the residual.
+        """
+        found, target = region(p, number, Region.PARAMETERS), region(p, number, Region.OUT)
+        xx, xy, yy = texture.gradient(p, number, ws)
+        extra = region(p, number, Region.MOMENTS) + number[p.n + Number.EXTRA] * p.stride
         mass, gradient = ws[extra], ws[extra + p.stride]
         smooth, level = ws[extra + 2 * p.stride], ws[extra + 3 * p.stride]
         solutions = number[p.n + Number.SOLUTIONS]
-        noise, energy, farthest = V(0.0), V(0.0), V(0.0)
+        known = value[p.v + Value.NOISE_LEVEL]
+        noise, energy, excess, farthest, gains = V(0.0), V(0.0), V(0.0), V(0.0), precise(0.0)
         for j in range(solutions):
             variance = ws[region(p, number, Region.VARIANCE) + j * p.stride]
             noise = noise + variance * (1.0 / ti.cast(solutions, precise))
-            energy = energy + variance * value[p.v + Value.NOISE + number[p.n + Number.FLOW] + j]
+            gain = value[p.v + Value.NOISE + number[p.n + Number.FLOW] + j]
+            gains += gain
+            energy = energy + variance * gain
+            excess = excess + (variance - ti.min(V(known), variance * precise(0.5))) * gain
             shift = V(0.0)
             for k in range(2):
                 column = j * number[p.n + Number.FLOW] + number[p.n + Number.FLOW_ROWS + k]
@@ -82,22 +100,31 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
                 shift = shift + u * u
             limit = value[p.v + Value.MAX_SHIFT]
             farthest = ti.select(shift < V(limit * limit), farthest, V(1.0))  # also where it is no number
-        floor = noise * (2.0 * value[p.v + Value.GAIN])
+        floor = texture.noise_variance(noise, p, value) * (2.0 * value[p.v + Value.GAIN])
         half = (xx + yy) * 0.5
         weakest = half - ti.sqrt(ti.max(half * half - (xx * yy - xy * xy), V(0.0)))
+        least = 2.0 * value[p.v + Value.LEAST_SHARE]
         # From the last reason to the first, which is the one that counts.
         result = ti.select(farthest > V(0.5), V(incoherent), V(ok))
-        result = ti.select((weakest < floor) | (weakest < half * 1e-4), V(aperture), result)
+        result = ti.select((weakest < floor) | (weakest < half * least), V(aperture), result)
         unsolved = ws[region(p, number, Region.CONVERGED)] < V(0.5)
         result = ti.select(unsolved, V(not_converged), result)
         largest = value[p.v + Value.MAX_RESIDUAL]
-        result = ti.select(energy < half * (2.0 * largest * largest), result, V(incoherent))
+        result = ti.select(excess < half * (2.0 * largest * largest), result, V(incoherent))
         # The constraint explains nothing: there is nothing but noise, or texture that does not move as one.
         rough = smooth > gradient * value[p.v + Value.ROUGHEST]
         nothing = ti.select(rough, V(incoherent), V(no_structure))
         result = ti.select(half > floor, result, nothing)
         result = ti.select(half > level * value[p.v + Value.MIN_STRUCTURE], result, V(no_structure))
-        return ti.select(mass < V(value[p.v + Value.MIN_MASS]), V(border), result)
+        expected = (V(known * gains) + half * value[p.v + Value.MISFIT]) * EXPECTED
+        agreement = ti.max(expected - energy, V(0.0)) / ti.max(expected + energy, V(TINY))
+        beyond = ti.max(weakest - floor * precise(0.5), V(0.0))
+        structure = beyond / ti.max(beyond + energy, V(TINY))
+        if number[p.n + Number.REWEIGHTED] == 1:
+            share = ws[region(p, number, Region.SHARE)]
+            ws[target + Output.SUPPORT * p.stride] = ti.min(share, V(1.0))
+        ws[target + Output.CONFIDENCE * p.stride] = agreement * agreement * structure * structure
+        ws[target + Output.STATUS * p.stride] = ti.select(mass < V(value[p.v + Value.MIN_MASS]), V(border), result)
 
     @ti.func
     def geometry_maps(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
@@ -130,6 +157,27 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
                 variance = variance + by_other * by_other * ws[second + (2 - k) * terms * p.stride]
                 variance = variance + 2.0 * by_own * by_other * ws[first + (2 - k) * terms * p.stride]
                 put(Output.SLOPE_X + k, c * own, variance, p, target, ws)
+
+    @ti.func
+    def normal_flow(p: ti.template(), number: ti.template(), ws: ti.template()):
+        """The flow's component along the window's dominant gradient (2.23).
+
+        Its size is as uncertain as the covariance says, its direction as much for every pixel of its size.
+        """
+        target, rows = region(p, number, Region.OUT), region(p, number, Region.COV_T)
+        offsets = number[p.n + Number.OFFSETS]
+        xx, xy, yy = texture.gradient(p, number, ws)
+        difference = (xx - yy) * 0.5
+        share = difference / ti.max(ti.sqrt(difference * difference + xy * xy), V(TINY))
+        nx = ti.sqrt(ti.max((share + 1.0) * 0.5, V(0.0)))
+        ny = ti.sqrt(ti.max((1.0 - share) * 0.5, V(0.0)))
+        ny = ti.select(xy < V(0.0), 0.0 - ny, ny)
+        size = nx * ws[target + Output.FLOW_X * p.stride] + ny * ws[target + Output.FLOW_Y * p.stride]
+        variance = nx * nx * ws[rows] + ny * ny * ws[rows + tri(offsets, offsets) * p.stride]
+        variance = variance + 2.0 * nx * ny * ws[rows + tri(offsets, 0) * p.stride]
+        turned = size * size
+        put(Output.NORMAL_FLOW_X, size * nx, variance * (nx * nx + ny * ny * turned), p, target, ws)
+        put(Output.NORMAL_FLOW_Y, size * ny, variance * (ny * ny + nx * nx * turned), p, target, ws)
 
     @ti.func
     def parameter(row: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
@@ -192,7 +240,7 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         """The maps of status, geometry, flow and brightness that the model has."""
         target, found = region(p, number, Region.OUT), region(p, number, Region.PARAMETERS)
         flow, rows = number[p.n + Number.FLOW], region(p, number, Region.COV_T)
-        ws[target + Output.STATUS * p.stride] = classify(p, number, value, ws)
+        classify(p, number, value, ws)
         if number[p.n + Number.TERMS] > 0:
             geometry_maps(p, number, value, ws)
         if number[p.n + Number.MOTION_SOLUTION] >= 0:
@@ -201,6 +249,7 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
                 column = number[p.n + Number.MOTION_SOLUTION] * flow + number[p.n + Number.FLOW_ROWS + k]
                 variance = ws[rows + tri(row, row) * p.stride]
                 put(Output.FLOW_X + k, ws[found + column * p.stride], variance, p, target, ws)
+            normal_flow(p, number, ws)
         if number[p.n + Number.BRIGHTNESS_COLUMN] >= 0:
             for j in range(number[p.n + Number.CAMERA_SOLUTIONS]):
                 at = found + (j * flow + number[p.n + Number.BRIGHTNESS_COLUMN]) * p.stride

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
+from leafflow_ti.kernels.identify import identify_functions
 from leafflow_ti.kernels.spec import EXTRA_PLANES, KernelSpec
 from leafflow_ti.kernels.workspace import Number, Region, Value
 
@@ -24,7 +25,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``load``, ``scale``, ``least_squares``, ``factorise``, ``accept``, ``inverse_iteration``, ``jacobi``,
     ``parameters``, ``residuals``, ``centre``, and of other estimators ``whiten``, ``unwhiten`` and ``fundamental``."""
     precise, lanes, V = spec.precise, spec.lanes, spec.element
-    small = dense(spec)
+    small, identify = dense(spec), identify_functions(spec)
 
     @ti.func
     def load(
@@ -320,11 +321,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
         """Parameters of constants become values at the window's centre, where centred squares are not 0."""
         found = region(p, number, Region.PARAMETERS)
         for j in range(number[p.n + Number.SOLUTIONS]):
-            first = found + j * number[p.n + Number.FLOW] * p.stride
-            for term in range(number[p.n + Number.CENTRE_TERMS]):
-                at = first + number[p.n + Number.CENTRE + 2 * term] * p.stride
-                square = first + number[p.n + Number.CENTRE + 2 * term + 1] * p.stride
-                ws[at] = ws[at] + ws[square] * value[p.v + Value.CENTRE + term]
+            identify.at_centre(found + j * number[p.n + Number.FLOW] * p.stride, p, number, value, ws)
 
     @ti.func
     def whiten(

@@ -14,7 +14,7 @@ from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.patch import RANGE_CODE, Patch, patch_functions
 from leafflow_ti.kernels.spec import KernelSpec
-from leafflow_ti.kernels.texture import texture_function
+from leafflow_ti.kernels.texture import texture_functions
 from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value
 
 START, CLEAR, FINISH, COVARIANCE, DIFFERENCES = 1, 2, 4, 8, 16
@@ -27,7 +27,7 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stage ``patch_fit``: adds a set of rows to the sums, and solves for the motion and its covariance with the
     last one. Its ``which`` is a sum of the above."""
     precise, V = spec.precise, spec.element
-    small, patch, smoothness = dense(spec), patch_functions(spec), texture_function(spec)
+    small, patch, texture = dense(spec), patch_functions(spec), texture_functions(spec)
 
     @ti.func
     def code_of(r: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
@@ -279,7 +279,7 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
         factor = V(1.0)
         if own:
             common = ws[kept] * ws[variance]
-            root = smoothness(p, number, ws) * ti.sqrt(ti.max(common, V(0.0)))
+            root = texture.smoothness(p, number, ws) * ti.sqrt(ti.max(common, V(0.0)))
             factor = ti.select(common > V(0.0), root, V(0.0))
         else:
             ws[kept] = ws[variance]

@@ -87,10 +87,13 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         moments, quadratic = region(p, number, Region.MOMENTS), region(p, number, Region.QUADRATIC)
         prepare(ti.cast(kind == Weights.PENALTY_PLAIN, ti.i32), p, number, value, ws)
         entries = number[p.n + Number.EXTRA]
-        residual = small.dot(ws, quadratic, 1, moments, 1, entries, p.stride)
+        # Means over what is seen of the window, as the residuals of the cells are.
+        seen = ti.max(ws[moments + entries * p.stride], V(1e-6))
+        residual = small.dot(ws, quadratic, 1, moments, 1, entries, p.stride) / seen
         ix, iy = number[p.n + Number.FLOW_ROWS], number[p.n + Number.FLOW_ROWS + 1]
         energy = ws[moments + number[p.n + Number.LOWER + tri(ix, ix)] * p.stride]
         energy = energy + ws[moments + number[p.n + Number.LOWER + tri(iy, iy)] * p.stride]
+        energy = energy / seen
         gain = precise(0.0)
         for j in range(k):
             gain += value[p.v + Value.NOISE + n - k + j] / ti.cast(k, precise)

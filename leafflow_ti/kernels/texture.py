@@ -1,20 +1,28 @@
-"""How smooth a window's texture is: the factor ρ of the noise that its filters leave."""
+"""A window's texture: how smooth it is, and how much of it could be noise."""
 
 import functools
+from types import SimpleNamespace
 
+from leafflow_ti.kernels.dense import tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.spec import KernelSpec
-from leafflow_ti.kernels.workspace import Number, Region
+from leafflow_ti.kernels.workspace import Number, Region, Value
+
+TRUSTED = 4.0
+"""Most that a noise level known beforehand may exceed the residual: fine texture may pass for noise in its estimate,
+but then the residual tells; a model with many columns fits a small window's noise, but not most of it."""
 
 
 @functools.cache
-def texture_function(spec: KernelSpec):
-    """The function that reads ρ, the share of the gradient's energy that survives one more smoothing."""
+def texture_functions(spec: KernelSpec) -> SimpleNamespace:
+    """``smoothness``, ``gradient`` and ``noise_variance``."""
     V = spec.element
 
     @ti.func
     def smoothness(p: ti.template(), number: ti.template(), ws: ti.template()):
+        """The factor ρ of the noise that filters leave: the share of the gradient's energy that survives one more
+        smoothing."""
         energy = region(p, number, Region.MOMENTS) + (number[p.n + Number.EXTRA] + 1) * p.stride
         plain, smooth = ws[energy], ws[energy + p.stride]
         some = plain > V(0.0)
@@ -24,4 +32,19 @@ def texture_function(spec: KernelSpec):
             share = share * ws[region(p, number, Region.SPREAD)]
         return share
 
-    return smoothness
+    @ti.func
+    def gradient(p: ti.template(), number: ti.template(), ws: ti.template()):
+        """The tensor [xx, xy; xy, yy] of the gradient: xx, xy, yy."""
+        moments, lower = region(p, number, Region.MOMENTS), p.n + Number.LOWER
+        ix, iy = number[p.n + Number.FLOW_ROWS], number[p.n + Number.FLOW_ROWS + 1]
+        xx = ws[moments + number[lower + tri(ix, ix)] * p.stride]
+        xy = ws[moments + number[lower + tri(iy, ix)] * p.stride]
+        yy = ws[moments + number[lower + tri(iy, iy)] * p.stride]
+        return xx, xy, yy
+
+    @ti.func
+    def noise_variance(residual: ti.template(), p: ti.template(), value: ti.template()):
+        """Image noise variance that texture must exceed: that of the residual, or the known one if it is larger."""
+        return ti.max(residual, ti.min(V(value[p.v + Value.NOISE_LEVEL]), residual * TRUSTED))
+
+    return SimpleNamespace(smoothness=smoothness, gradient=gradient, noise_variance=noise_variance)

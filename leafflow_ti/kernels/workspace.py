@@ -291,8 +291,11 @@ class Value(IntEnum):
     MAX_RESIDUAL = auto()  # px, for status incoherent
     MAX_SHIFT = auto()  # px per step or frame, likewise
     MOTION_SCALE = auto()  # 2: mm per px of range flow's U', V', and of W
-    GAP = MOTION_SCALE + 2  # convergence: residual per gap
-    NOISE_LEVEL = auto()  # variance of the images' noise, 0 where it is not known
+    NOISE_LEVEL = MOTION_SCALE + 2  # variance of the image noise as far as it is known beforehand, else 0
+    LEAST_SHARE = auto()  # share of the gradient's mean energy that is no texture where there is less noise than that
+    UNKNOWN = auto()  # noise over information at which a direction of the parameters is not determined
+    MISFIT = auto()  # px²: square of the misfit that is the model's, for the confidence
+    GAP = auto()  # convergence: residual per gap
     SCALE_START = auto()  # σ² of the penalty: first one, per mean squared residual
     SCALE_SHRINK = auto()  # from one round to the next
     LEAST_NOISE = auto()  # least one: per variance of the noise, and
@@ -300,9 +303,7 @@ class Value(IntEnum):
     MOST_NOISE = auto()  # largest squared residual of a plain fit that did not fail, likewise
     MOST_DISPLACED = auto()
     RELAXATION = auto()  # factor of a relaxation step
-    MAX_CONTRADICTION = (
-        auto()
-    )  # mean squared difference of an own flow's rows, per variance, from the reference's motion
+    MAX_CONTRADICTION = auto()  # of an own flow's rows and the reference's motion, per variance
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
@@ -75,6 +75,11 @@ class EstimateStage:
         places = self._groups if self.apart else self._tasks
         self._workspace = device.empty(places * self.layout.n_elements * lanes, "algebra")
         self._maps = device.empty(Output.PLANES * n_pixels)
+
+    def set_noise(self, noise: float) -> None:
+        """Go on to images of another noise level [grey values]; takes effect with the next ``set_view``."""
+        self.problem = replace(self.problem, noise=noise)
+        self._tables.set_noise(noise)
 
     def set_view(self, view: View) -> None:
         """Move to another band of the same size."""

@@ -52,6 +52,11 @@ MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
 """Least energy of the gradient relative to that of the image, (8 eps)²: below, it is the rounding of a constant."""
 MIN_MASS = 0.2
 """Least share of the window's weight that must lie inside the images (a corner pixel has 1/4)."""
+LEAST_SHARE = 5e-5
+"""Share of the gradient's mean energy in a direction that is no texture, however little noise there is: what filters
+and rounding leave."""
+MISFIT_PX = 0.05
+"""Misfit of the brightness constraint that is usual without noise, as a displacement."""
 MAX_RESIDUAL_PX = 0.5
 """Root mean square misfit of the brightness constraint, as a displacement, above which a window is incoherent."""
 
@@ -75,7 +80,7 @@ def _packed(a: int, b: int) -> int:
 SCALE_START = 1.0
 """Of the penalty's σ², per mean squared residual of the plain fit: everything counts, more or less."""
 SCALE_SHRINK = 0.5
-LEAST_NOISE, LEAST_PX = 2.0, 0.007
+LEAST_NOISE, LEAST_PX = 2.0, 0.02
 """Least σ² of the penalty: so many variances of the noise, and what models leave out, as a displacement."""
 MOST_NOISE, MOST_PX = 3.0, 0.02
 """Squared residual above which the plain fit failed, likewise."""
@@ -159,6 +164,7 @@ class ProblemTables:
             self.tables += [
                 Tables(t.number.copy(), self._unscaled(t.value, c)) for t, c in zip(self.tables, owners, strict=True)
             ]
+        self.set_noise(problem.noise)
 
     def _rows(self) -> SimpleNamespace:
         """Columns of the motion rows and of each camera solution's geometry rows; brightness rows stand last."""
@@ -232,6 +238,10 @@ class ProblemTables:
         value[Value.NOISE : Value.NOISE + columns.n] = noise
         value[Value.GAIN] = noise[flow_rows[0]]
         value[Value.MIN_MASS], value[Value.MAX_RESIDUAL] = MIN_MASS, MAX_RESIDUAL_PX
+        value[Value.LEAST_SHARE] = LEAST_SHARE
+        # Undetermined is what holds no more texture than noise, in J_ff without the share that is taken out.
+        value[Value.UNKNOWN] = 2.0 - DENOISE[problem.estimator]
+        value[Value.MISFIT] = 2 * MISFIT_PX**2
         value[Value.ROUGHEST] = 1.5 * white_smoothness(sampling)
         value[Value.MIN_STRUCTURE] = MIN_STRUCTURE[self.device.storage]
         for code, name in enumerate(("1", *AXES, "range")):
@@ -303,6 +313,13 @@ class ProblemTables:
             found.append(Tables(number, value))
         return found
 
+    def set_noise(self, noise: float) -> None:
+        """Enter the noise level of the images [grey values]."""
+        from leafflow_ti.kernels.workspace import Value
+
+        for tables in self.tables:
+            tables.value[Value.NOISE_LEVEL] = noise**2
+
     def aim(self, view: View) -> None:
         """Enter the camera and the output grid."""
         from leafflow_ti.kernels.workspace import Value
@@ -342,7 +359,6 @@ class ProblemTables:
         columns = cells.request.columns
         constant = [max(c.terms[0].exponents) == 0 for c in columns.columns]
         number[Number.CONSTANT : Number.CONSTANT + columns.n] = constant
-        value[Value.NOISE_LEVEL] = problem.noise**2
         value[Value.SCALE_START], value[Value.SCALE_SHRINK] = SCALE_START, SCALE_SHRINK
         value[Value.LEAST_NOISE], value[Value.LEAST_DISPLACED] = LEAST_NOISE, LEAST_PX**2
         value[Value.MOST_NOISE], value[Value.MOST_DISPLACED] = MOST_NOISE, MOST_PX**2

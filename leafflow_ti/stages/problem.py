@@ -39,7 +39,7 @@ class Problem:
 
     ``offsets`` and ``use_range`` are what ``models.parse_rows`` returned; ``fitted``: unknowns of the motion fit to the
     reference's rows (0: none), from which a fit with ``own_flows`` starts. ``range_scale``: of range flow, mm per px of
-    (U', V') and of W. ``noise``: standard deviation of the images' noise, grey values, 0 where it is not known;
+    (U', V') and of W. ``noise``: standard deviation of the images' noise, grey values, as far as it is known;
     ``scale``: of the coordinates in raw units (section 2.3.3); ``penalty`` and ``robust``: of robust estimators, how
     residuals count and which pixels are estimated anew.
     """

@@ -27,7 +27,7 @@ from leafflow_ti.stages.windows import Windows, taps
 from leafflow_ti.trace import span
 
 __all__ = ["EXTRA_PLANES", "FACTOR_PLANES", "OUTPUT_PLANES", "Band", "Request", "TensorStage", "band_bytes"]
-OUTPUT_PLANES = 61
+OUTPUT_PLANES = 67
 TASKS = 32
 """Tasks of a launch that the memory plan allows for."""
 

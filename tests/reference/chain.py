@@ -4,7 +4,7 @@ the kernels.
 Only the tables (columns, filters, noise factors) come from the library.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import correlate1d, minimum_filter
@@ -29,40 +29,53 @@ def filters_see(valid, sampling: Sampling):
     return minimum_filter(valid.astype(float), size, mode="nearest")
 
 
-def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels, valid=None):
-    """J [n, N, N] by direct sums of d d^T over the window around each pixel (x, y), middle camera and frame.
+def window_of(images, sampling: Sampling, columns: ColumnSet, pixel, valid=None):
+    """Data vectors [N, t, sy, sx, y, x] of the window around a pixel (x, y), middle camera and frame; which samples
+    count, [t, 1, 1, y, x].
 
-    Samples whose filters see a pixel that is not ``valid`` [t, y, x] have no weight.
+    There are several vectors where columns are shared. Samples whose filters see a pixel that is not ``valid``
+    [t, y, x] do not count.
     """
-    channels = {c: derivative(images, sampling, c) for c in columns.channels}
-    centre = {a: images.shape[ARRAY_AXIS[a]] // 2 for a in ("t", "sy", "sx")}
-    half = {a: sampling.axis(a).size // 2 for a in AXES}
-    offsets = {a: np.arange(-half[a], half[a] + 1, dtype=float) for a in AXES}
-    grids = dict(zip(ARRAY_AXIS, np.meshgrid(*(offsets[a] for a in ARRAY_AXIS), indexing="ij"), strict=True))
-    weight = np.ones(next(iter(grids.values())).shape)
-    for a in ARRAY_AXIS:
-        shape = [1] * 5
-        shape[ARRAY_AXIS[a]] = -1
-        weight = weight * np.array(sampling.axis(a).weights).reshape(shape)
+    reach = {a: sampling.axis(a).size // 2 for a in ARRAY_AXIS}
+    where = {a: images.shape[ARRAY_AXIS[a]] // 2 for a in ("t", "sy", "sx")} | dict(zip("xy", pixel, strict=True))
+    window = {a: slice(where[a] - reach[a], where[a] + reach[a] + 1) for a in ARRAY_AXIS}
+    channels = {c: derivative(images, sampling, c)[tuple(window.values())] for c in columns.channels}
+    grids = offsets(sampling)
+    vectors = []
+    for number in sorted({term.vector for column in columns.columns for term in column.terms}):
+        d = np.zeros((columns.n, *grids["t"].shape))
+        for i, column in enumerate(columns.columns):
+            for term in (term for term in column.terms if term.vector == number):
+                d[i] += term.factor * channels[term.channel] * monomial(grids, term.exponents)
+        vectors.append(d)
     seen = np.ones((len(images), *images.shape[3:])) if valid is None else filters_see(valid, sampling)
+    return vectors, seen[window["t"], window["y"], window["x"]][:, None, None]
+
+
+def offsets(sampling: Sampling):
+    """Offset of every sample of the window from its centre, by axis, each [t, sy, sx, y, x]."""
+    along = [np.arange(n, dtype=float) - n // 2 for n in (sampling.axis(a).size for a in ARRAY_AXIS)]
+    return dict(zip(ARRAY_AXIS, np.meshgrid(*along, indexing="ij"), strict=True))
+
+
+def monomial(grids, exponents):
+    """``Δ^exponents`` of every sample."""
+    return np.prod([grids[a] ** e for a, e in zip(AXES, exponents, strict=True)], axis=0)
+
+
+def window_weights(sampling: Sampling):
+    """Weight of every sample of the window [t, sy, sx, y, x]."""
+    return np.einsum("i,j,k,l,m", *(np.array(sampling.axis(a).weights) for a in ARRAY_AXIS))
+
+
+def structure_tensor(images, sampling: Sampling, columns: ColumnSet, pixels, valid=None):
+    """J [n, N, N] by direct sums of d d^T over the window around each pixel (x, y), see ``window_of``."""
     result = []
-    for x, y in pixels:
-        where = {**centre, "x": x, "y": y}
-        window = tuple(slice(where[a] - half[a], where[a] + half[a] + 1) for a in ARRAY_AXIS)
-        d = []
-        for column in columns.columns:
-            d.append({})
-            for term in column.terms:
-                value = term.factor * channels[term.channel][window]
-                for a, e in zip(AXES, term.exponents, strict=True):
-                    value *= grids[a] ** e
-                d[-1][term.vector] = d[-1].get(term.vector, 0.0) + value.ravel()
-        counted = (weight * seen[window[0], None, None, window[3], window[4]]).ravel()
-        J = np.zeros((columns.n, columns.n))
-        for vector in {v for values in d for v in values}:
-            one = np.array([values.get(vector, np.zeros(counted.size)) for values in d])
-            J += (one * counted) @ one.T
-        result.append(J)
+    for pixel in pixels:
+        vectors, seen = window_of(images, sampling, columns, pixel, valid)
+        weights = (window_weights(sampling) * seen).ravel()
+        flat = [d.reshape(columns.n, -1) for d in vectors]
+        result.append(sum((d * weights) @ d.T for d in flat))
     return np.array(result)
 
 
@@ -104,13 +117,20 @@ def solutions_ols(J, columns: ColumnSet):
     return -np.linalg.solve(J[:n, :n], J[:n, n:])
 
 
-def solutions_tls(J, columns: ColumnSet, noise=None):
-    """P [n_flow, k] from the k smallest eigenvectors, combined so that one time-like differential is 1 (3.3.2)."""
-    s = np.ones(columns.n) if noise is None else noise**-0.5
-    _, vectors = np.linalg.eigh(J * np.outer(s, s))
-    v = vectors[:, : columns.n_time_like] * s[:, None]
+def solutions_tls(J, columns: ColumnSet, scales):
+    """P [n_flow, k] from the k smallest eigenvectors, combined so that one time-like differential is 1 (3.3.2).
+
+    ``scales`` [N]: what the columns are multiplied by.
+    """
+    _, vectors = np.linalg.eigh(J * np.outer(scales, scales))
+    v = vectors[:, : columns.n_time_like] * scales[:, None]
     n = columns.n_flow
     return v[:n] @ np.linalg.inv(v[n:])
+
+
+def coordinate_scales(columns: ColumnSet, scale):
+    """Factors [N] of columns in raw units where those of the image coordinates are ``1 / scale`` px."""
+    return np.array([float(scale) ** sum(c.terms[0].exponents[:2]) for c in columns.columns])
 
 
 def noise_variance(J, P, columns: ColumnSet, noise):
@@ -127,32 +147,68 @@ def solution_noise(J, columns: ColumnSet, sampling: Sampling, solution):
     return T @ (R @ J[:n, :n] @ R.T * noise_ratio(sampling, columns, solution)[0]) @ T.T
 
 
-def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, denoise=0.9):
-    """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions.
+@dataclass(frozen=True)
+class Solved:
+    """A solution and what its covariances follow from.
 
-    ``denoise``: the share of the noise of its own columns, at the variance of the quietest solution, that J_ff loses.
+    ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
+    the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
+    ``anew``: the window was weighted anew.
     """
-    n, k = columns.n_flow, columns.n_time_like
-    noise = np.diag(column_noise(sampling, columns)[:n])
-    inverse = np.linalg.inv(J[:n, :n] - denoise * np.min(variances) * noise)
-    cov = np.zeros((k, k, n, n))
-    for i, one in enumerate(columns.solutions):
-        for j, two in enumerate(columns.solutions):
-            M = np.zeros((n, n))
-            if i == j:
-                M = solution_noise(J, columns, sampling, one)
-            else:
-                for term in cross_noise(sampling, columns, one, two):
-                    M[term.a, term.b] = J[term.base_a, term.base_b] * term.value
-            cov[i, j] = rho * np.sqrt(variances[i] * variances[j]) * inverse @ M @ inverse
-    return cov
+
+    J: np.ndarray
+    P: np.ndarray
+    variance: np.ndarray
+    noise: np.ndarray
+    rho: float
+    anew: bool = False
+
+    @classmethod
+    def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
+        """By one of the estimators without weights, see ``solve``."""
+        return cls(J, *solve(J, columns, sampling, estimator, scale), np.diag(column_noise(sampling, columns)), rho)
+
+    def clean(self, denoise):
+        """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""
+        n = len(self.P)
+        return self.J[:n, :n] - denoise * np.min(self.variance) * self.noise[:n, :n]
+
+    def covariances(self, columns: ColumnSet, sampling: Sampling, denoise):
+        """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions."""
+        n, k = columns.n_flow, columns.n_time_like
+        inverse = np.linalg.inv(self.clean(denoise))
+        cov = np.zeros((k, k, n, n))
+        for i, one in enumerate(columns.solutions):
+            for j, two in enumerate(columns.solutions):
+                M = np.zeros((n, n))
+                if i == j:
+                    M = solution_noise(self.J, columns, sampling, one)
+                else:
+                    for term in cross_noise(sampling, columns, one, two):
+                        M[term.a, term.b] = self.J[term.base_a, term.base_b] * term.value
+                cov[i, j] = self.rho * np.sqrt(self.variance[i] * self.variance[j]) * inverse @ M @ inverse
+        return cov
+
+    def at_centre(self, columns: ColumnSet, sampling: Sampling, denoise):
+        """Parameters and covariances of monomials, see ``at_centre``."""
+        return at_centre(self.P, self.covariances(columns, sampling, denoise), columns)
 
 
-def solve(J, columns: ColumnSet, sampling: Sampling, estimator):
-    """Parameters P [n_flow, k] of one of the estimators, and the noise variance [k] of their residuals."""
+def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, denoise=0.9):
+    """The same for a tensor and the variances [k] of its residuals."""
+    solved = Solved(J, np.empty((columns.n_flow, 0)), variances, np.diag(column_noise(sampling, columns)), rho)
+    return solved.covariances(columns, sampling, denoise)
+
+
+def solve(J, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
+    """Parameters P [n_flow, k] of one of the estimators, and the noise variance [k] of their residuals.
+
+    ``scale``: see ``coordinate_scales``; of raw total least squares.
+    """
     noise = column_noise(sampling, columns)
     if estimator == "ols":
         P = solutions_ols(J, columns)
     else:
-        P = solutions_tls(J, columns, noise if estimator == "tls-equilibrated" else None)
+        scales = noise**-0.5 if estimator == "tls-equilibrated" else coordinate_scales(columns, scale)
+        P = solutions_tls(J, columns, scales)
     return P, noise_variance(J, P, columns, noise)

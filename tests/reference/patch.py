@@ -1,11 +1,12 @@
 """Naive float64 twin of what follows the flow parameters: geometry, the fit of the motion, every map of a pixel."""
 
 import numpy as np
-from reference.chain import at_centre, covariances, solution_noise, solve
+from reference.chain import solution_noise
 
 from leafflow_ti.models import AXES, ColumnSet
-from leafflow_ti.sampling import column_noise, difference_variance
-from leafflow_ti.stages.estimate_tables import DENOISE, MODEL_ERROR, TURNING_ERROR
+from leafflow_ti.sampling import difference_variance
+from leafflow_ti.stages.estimate_tables import DENOISE, MAX_CONTRADICTION, MODEL_ERROR, TURNING_ERROR
+from leafflow_ti.stages.estimators import ESTIMATORS
 
 
 def fit_geometry(P, cov, columns: ColumnSet, baseline, shift, weighted=True):
@@ -154,7 +155,7 @@ def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampl
     return P_inverse @ X @ own_inverse
 
 
-def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()):
+def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
     """The motion, three covariances, and the motion (N, Ω, A) from the reference's rows alone.
 
     The covariances are those of the unknowns, and of their central differences along x and y; in a difference, a row is
@@ -162,11 +163,11 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
 
     ``geometry`` is what fit_geometry returned.
 
-    ``own``: (J, ρ) of every camera's own flow, in the order of ``problem.own_flows.steps``. First comes a fit to the
-    rows of the reference model; with own flows, one more to all rows, linearised there. The rows' covariance holds the
-    noise of the motion parameters, of the geometry that the design is built from, what both have in common and what
-    cameras have in common with the reference model. The weights leave out what is common to sets of rows, and to
-    geometry and motion.
+    ``P``, ``cov``: of ``solved``, at the centre. ``own``: the solution of every camera's own flow, in the order of
+    ``problem.own_flows.steps``. First comes a fit to the rows of the reference model; with own flows, one more to all
+    rows, linearised there. The rows' covariance holds the noise of the motion parameters, of the geometry that the
+    design is built from, what both have in common and what cameras have in common with the reference model. The weights
+    leave out what is common to sets of rows, and to geometry and motion.
     """
     columns, sampling, f = problem.columns, problem.sampling, view.f_px
     shift, baseline = view.shift_px, view.baseline_mm
@@ -176,10 +177,8 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
     surface_terms[: min(3, len(g))] = g[:3]
     k = columns.solutions.index("t")
     it = names.index("t") if "t" in names else None
-    clean = J[: columns.n_flow, : columns.n_flow] - DENOISE[problem.estimator] * np.min(variance) * np.diag(
-        column_noise(sampling, columns)[: columns.n_flow]
-    )
-    inverse = np.linalg.inv(clean)
+    denoise = DENOISE[problem.estimator]
+    inverse = np.linalg.inv(solved.clean(denoise))
 
     def rows_of(value, C, shared, design, codes, has_range, q):
         """Design, values, own covariance, sensitivity, covariance with the geometry, what the equations leave out."""
@@ -215,10 +214,10 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
 
         return rows_of(value, C, shared, design, codes, problem.use_range, q), rows
 
-    def own_rows(step, J_own, rho_own, q):
+    def own_rows(step, found_own, q):
         flows = problem.own_flows
-        p, s2 = solve(J_own, flows.columns, flows.sampling, problem.estimator)
-        C = covariances(J_own, s2, flows.columns, flows.sampling, rho_own, DENOISE[problem.estimator])[0, 0]
+        p, s2 = found_own.P, found_own.variance
+        C = found_own.covariances(flows.columns, flows.sampling, denoise)[0, 0]
         rows = [flows.columns.index(d, o) for d in ("x", "y") for o in flows.offsets]
         E = np.eye(flows.columns.n_flow)[rows]
         moved = [step[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
@@ -236,12 +235,10 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
 
         codes = [*flows.offsets, *flows.offsets]
         found = rows_of(E @ p[:, 0], E @ C @ E.T, np.zeros((len(g), len(rows))), design, codes, False, q)
-        n = flows.columns.n_flow
-        noise = np.diag(column_noise(flows.sampling, flows.columns)[:n])
-        own_inverse = np.linalg.inv(J_own[:n, :n] - DENOISE[problem.estimator] * s2[0] * noise)
+        own_inverse = np.linalg.inv(found_own.clean(denoise))
         shared = shared_covariance(
-            J_own, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
-        ) * (rho_own * np.sqrt(variance[k] * s2[0]))
+            found_own.J, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
+        ) * (found_own.rho * np.sqrt(solved.variance[k] * s2[0]))
         return found, shared @ E.T
 
     def fit(sets, which, common):
@@ -280,8 +277,14 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
         return q[: problem.fitted], spreads, q
     first, rows = reference_rows(q)
     sets, common = ([first], []) if problem.own_flows.reference_rows else ([], [])
-    for step, (J_own, rho_own) in zip(problem.own_flows.steps, own, strict=True):
-        found, shared = own_rows(step, J_own, rho_own, q)
+    for step, one in zip(problem.own_flows.steps, own, strict=True):
+        found, shared = own_rows(step, one, q)
+        if ESTIMATORS[problem.estimator].robust and problem.own_flows.reference_rows and one.anew:
+            # A robust estimate may have chosen another surface in this camera.
+            A, value, C, D, _, left_out, _ = found
+            own_errors = np.diag(C + D @ cov_g @ D.T + left_out)
+            if np.mean((value - A @ q) ** 2 / own_errors) > MAX_CONTRADICTION:
+                continue
         if problem.own_flows.reference_rows:
             common.append(np.pad(shared[rows], ((0, problem.use_range), (0, 0))))
         elif sets:
@@ -291,15 +294,13 @@ def fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own=()
     return *fit(sets, which, common), q
 
 
-def measure(J, rho, problem, view, x, y, own=()):
+def measure(solved, problem, view, x, y, own=()):
     """Every map of one pixel (x, y): name -> (value, standard error). ``problem``, ``view``: what the stages get.
 
-    ``own``: (J, ρ) of every camera's own flow.
+    ``solved``, ``own``: the solution of the reference model, those of every camera's own flow (``chain.Solved``).
     """
     columns, sampling = problem.columns, problem.sampling
-    P, variance = solve(J, columns, sampling, problem.estimator)
-    cov = covariances(J, variance, columns, sampling, rho, DENOISE[problem.estimator])
-    P, cov = at_centre(P, cov, columns)
+    P, cov = solved.at_centre(columns, sampling, DENOISE[problem.estimator])
     x0, y0, f = x - view.principal_px[0], y - view.principal_px[1], view.f_px
     found = {}
     for k, axis in enumerate(columns.solutions):
@@ -332,7 +333,7 @@ def measure(J, rho, problem, view, x, y, own=()):
         put("slope_x", lambda g: surface(x0, y0, f, *g)[1])
         put("slope_y", lambda g: surface(x0, y0, f, *g)[2])
     if problem.unknowns:
-        q, (cov_q, *_), alone = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
+        q, (cov_q, *_), alone = fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own)
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
         for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=False):
             found[name] = (value, error)
@@ -352,14 +353,13 @@ def measure(J, rho, problem, view, x, y, own=()):
     return found
 
 
-def velocity_differences(J, rho, problem, view, x, y, own=()):
+def velocity_differences(solved, problem, view, x, y, own=()):
     """Covariances of the velocity's central differences: name -> (value, geometric mean of its variances)."""
     columns, sampling = problem.columns, problem.sampling
-    P, variance = solve(J, columns, sampling, problem.estimator)
-    cov = covariances(J, variance, columns, sampling, rho, DENOISE[problem.estimator])
+    P, cov = solved.P, solved.covariances(columns, sampling, DENOISE[problem.estimator])
     geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
     x0, y0 = x - view.principal_px[0], y - view.principal_px[1]
-    _, (_, *spreads), _ = fit_motion(x0, y0, J, rho, P, variance, cov, geometry, problem, view, own)
+    _, (_, *spreads), _ = fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own)
     found = {}
     for axis, C in zip(("x", "y"), spreads, strict=True):
         for a, b in ("xx", "xy", "yy", "xz", "yz", "zz"):

@@ -37,19 +37,19 @@ def radius(sampling: Sampling):
     return np.sqrt(np.sum(weights * (np.arange(weights.size) - weights.size // 2) ** 2.0))
 
 
-def structure_tensor(images, depth, noise, image_noise, beta, constraint, terms, sampling, f, working, pixel):
-    """J [n, n] of the columns (U', V', W, brightness, time) in px/frame at ``pixel`` (x, y): U' and V' as they are seen
-    at the working distance, W as it is seen there at the radius of the window.
+def window_of(images, depth, noise, image_noise, beta, constraint, terms, sampling, f, working, pixel):
+    """Data vectors [n, t, 1, 1, y, x] of the columns (U', V', W, brightness, time) in px/frame around ``pixel`` (x, y):
+    U' and V' as they are seen at the working distance, W as it is seen there at the radius of the window. And which
+    samples count, [t, 1, 1, y, x]: those without range (NaN) do not.
 
-    ``images``, ``depth``, ``noise``: [t, y, x]; samples without range (NaN) have no weight.
+    ``images``, ``depth``, ``noise``: [t, y, x].
     """
     half = {a: sampling.axis(a).size // 2 for a in ("t", "y", "x")}
     middle = {"t": len(images) // 2, "y": pixel[1], "x": pixel[0]}
     window = tuple(slice(middle[a] - half[a], middle[a] + half[a] + 1) for a in ("t", "y", "x"))
     offset = np.meshgrid(*(np.arange(-half[a], half[a] + 1.0) for a in ("t", "y", "x")), indexing="ij")
     offset = dict(zip(("t", "y", "x"), offset, strict=True))
-    weight = np.einsum("i,j,k", *(np.array(sampling.axis(a).weights) for a in ("t", "y", "x")))
-    weight = weight * chain.filters_see(np.isfinite(depth), sampling)[window]
+    seen = chain.filters_see(np.isfinite(depth), sampling)[window]
     filled = np.nan_to_num(depth, nan=1.0)
     Z, sigma = filled[window], np.nan_to_num(noise, nan=1.0)[window]
     s, w = working / f, working / radius(sampling)  # mm per px
@@ -81,18 +81,19 @@ def structure_tensor(images, depth, noise, image_noise, beta, constraint, terms,
                 value = value - moment(name[0]) * d["i"][window]
             row.append(value)
         vectors.append([v / norm / np.sqrt(len(kinds)) for v in (*row, d["t"][window])])
-    J = 0.0
-    for vector in vectors:
-        d = np.array([v.ravel() for v in vector])
-        J = J + (d * weight.ravel()) @ d.T
-    return J
+    return [np.array(vector)[:, :, None, None] for vector in vectors], seen[:, None, None]
 
 
-def velocity(J, rho, columns, sampling, estimator, denoise, f, working, x0, y0):
+def structure_tensor(vectors, seen, sampling):
+    """J [n, n] of what ``window_of`` returns."""
+    weight = (chain.window_weights(sampling) * seen).ravel()
+    flat = [vector.reshape(len(vector), -1) for vector in vectors]
+    return sum((d * weight) @ d.T for d in flat)
+
+
+def velocity(solved, columns, sampling, denoise, f, working, x0, y0):
     """(U, V, W) in mm/frame with covariance, brightness parameters with theirs; x0, y0 from the principal point."""
-    P, variance = chain.solve(J, columns, sampling, estimator)
-    cov = chain.covariances(J, variance, columns, sampling, rho, denoise)
-    P, cov = chain.at_centre(P, cov, columns)
+    P, cov = solved.at_centre(columns, sampling, denoise)
     T = np.array([[1, 0, x0 / f], [0, 1, y0 / f], [0, 0, 1]]) @ np.diag(
         [working / f, working / f, working / radius(sampling)]
     )

@@ -26,10 +26,10 @@ class Estimator:
     """``moves``: a function of the solver ("fast" or "jacobi"). They leave parameters, residual variances and the
     factor of the equilibrated tensor in the workspace.
 
-    ``weighs``: windows are weighted anew; ``robust``: by their residuals. ``denoise``: share of the gradients' own noise
-    that the covariances take out of J_ff; none where J_ff is divided by as it is, or where the residual is no bound for
-    the eigenvalues of the equilibrated tensor. What noise adds to J_ff is no structure: taking nearly all of it leaves
-    the matrix definite where there is nothing else, and makes the standard errors there ten times larger.
+    ``weighs``: windows are weighted anew; ``robust``: by their residuals. ``denoise``: share of the gradients' own
+    noise that the covariances take out of J_ff; none where J_ff is divided by as it is, or where the residual is no
+    bound for the eigenvalues of the equilibrated tensor. What noise adds to J_ff is no structure: taking nearly all of
+    it leaves the matrix definite where there is nothing else, and makes the standard errors there ten times larger.
     """
 
     moves: Callable[[str], list[Move]]
