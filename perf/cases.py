@@ -49,6 +49,15 @@ CASES = (
         "hci-cotton", "cotton:run", "real 9x9 light field: disparity and normals of the whole image against its truth"
     ),
     Case("yosemite", "yosemite:run", "affine optical flow of the Yosemite sequence against its truth"),
+    Case("estimators-scale", "estimators.scale:run", "angular error against the local scale k (Figure 2.6)"),
+    Case(
+        "estimators-discontinuity",
+        "estimators.discontinuity:run",
+        "error across a motion discontinuity, by penalty and schedule (Figures 2.8, 2.11)",
+    ),
+    Case("estimators-filters", "estimators.filters:run", "Yosemite with every filter set and estimator (Table 2.1)"),
+    Case("estimators-edges", "estimators.edges:run", "the cube within 20 px of its edges, plain and robust"),
+    Case("estimators-coverage", "estimators.coverage:run", "whether error bars are true, by estimator and noise"),
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
     Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),
     Case("stages", "stages:run", "microseconds per output pixel and stage, share of the machine's ceilings; memory"),
