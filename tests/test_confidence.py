@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +98,6 @@ def test_confidence_is_a_share_and_none_without_texture() -> None:
 
 @pytest.mark.skipif(absent(yosemite.NAME) is not None, reason="the sequence is not there")
 def test_the_confident_half_of_yosemite_has_half_the_error(tmp_path: Path) -> None:
-    field = yosemite.estimate_flow(tmp_path, replace(yosemite.Settings(), stride=2), "tls-equilibrated")
+    field = yosemite.estimate_flow(tmp_path, **yosemite.PLAIN, stride=2)
     half, whole = mean_errors(field, yosemite.errors_of(field, yosemite.Truth.read()), (0.5, 1.0))
     assert half <= 0.5 * whole

@@ -6,7 +6,6 @@ beside them. Skipped where the data, which does not belong to the project, is ab
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +64,7 @@ def test_light_field_is_measured_up_to_its_borders_and_better_with_three_preshif
 
 @needs(yosemite.NAME)
 def test_yosemite_beats_the_printed_error_at_full_density(tmp_path: Path) -> None:
-    field = yosemite.estimate_flow(tmp_path, replace(yosemite.Settings(), stride=4), "tls-equilibrated")
+    field = yosemite.estimate_flow(tmp_path, **yosemite.PLAIN, stride=4)
     figures = yosemite.figures_of("here", field, yosemite.Truth.read())
     error, median, density = figures
     assert density.value > 99.0

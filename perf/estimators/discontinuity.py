@@ -64,7 +64,7 @@ def errors(
     around the line, which lies left of the column ``reach``."""
     found = []
     for seed in range(settings.seeds):
-        scene = Scene(*motions, size=settings.size | 1, noise=settings.noise, seed=seed)
+        scene = Scene(LEFT, RIGHT, size=settings.size | 1, noise=settings.noise, seed=seed)
         middle = scene.size // 2
         roi = (
             middle - settings.reach, middle - settings.rows // 2,
@@ -98,7 +98,7 @@ def _figures(settings: Settings, found: dict[str, Array], distance: Array) -> li
 
 
 def run_settings(settings: Settings, out: Path) -> Outcome:
-    """Both figures. What is printed is an ordering: the Lorentzian is best, the joint fit worse than translation first."""
+    """Both figures. What is printed are orderings: the Lorentzian is best, the joint fit worse than translation first."""
     found = {label: errors(settings, options) for label, options in CURVES.items()}
     for label, schedule in SCHEDULES.items():
         with replaced("robust-tls", schedule):

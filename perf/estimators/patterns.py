@@ -6,7 +6,6 @@ is read where its points were at t = 0: waves of random direction and phase, whi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,8 +112,3 @@ def measure(images: Array, **options: Any) -> Field:
 def angular_errors(field: Field, truth: Array) -> Array:
     """Angular errors [y, x] in degrees; NaN where there is no value."""
     return aae(vectors(field, "flow", "xy"), truth[np.ix_(field.y, field.x)])
-
-
-def options_text(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as they are printed among the settings."""
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in options.items()}
