@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import probe, read_gray
 from leafflow_ti.capture.pattern import Pattern
-from leafflow_ti.config import WindowSection
+from leafflow_ti.config_sections import WindowSection
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import gaussian_weights
 from leafflow_ti.noise import white_noise

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from reference import chain
+from reference import cells, chain
 from reference import estimators as weighted
 
 from leafflow_ti.field import MOTION_NAMES
@@ -211,7 +211,7 @@ class Bench:
             ..., y - self.band.halo_y : y + self.band.halo_y + 1, x - self.band.halo_x : x + self.band.halo_x + 1
         ]
         at = (self.band.halo_x, self.band.halo_y)
-        return [weighted.window(self.own_images(*s)[part], *self.own_columns, at, None, weighed) for s in self.steps]
+        return [cells.window(self.own_images(*s)[part], *self.own_columns, at, None, weighed) for s in self.steps]
 
     @cached_property
     def planes(self) -> np.ndarray:
@@ -234,7 +234,7 @@ class Bench:
     @functools.cache  # noqa: B019 - a bench lives as long as the session
     def reference(self, row: int, col: int, weighed: bool = False) -> tuple[Any, float]:
         """J [N, N] or, where windows are weighted, the cells of one output pixel by the naive twin; and ρ."""
-        return weighted.window(self.images, self.sampling, self.columns, self.position(row, col), self.valid, weighed)
+        return cells.window(self.images, self.sampling, self.columns, self.position(row, col), self.valid, weighed)
 
     def solved(self, row: int, col: int, problem: Problem) -> tuple[chain.Solved, list[chain.Solved]]:
         """What the naive twin finds at one output pixel, and from every camera's own flow."""

@@ -17,7 +17,7 @@ import pytest
 import tifffile
 import typer
 
-from leafflow_ti import __version__, config, errors
+from leafflow_ti import __version__, config, config_sections, errors
 from leafflow_ti.cli import main as cli
 from leafflow_ti.cli import options
 from leafflow_ti.cli.progress import ProgressLine, format_duration, format_progress, format_rate
@@ -324,6 +324,8 @@ def test_run_without_capture_exits_with_4_or_3(
         "Deformation",
         "Brightness",
         "Estimator",
+        "Penalty",
+        "Robust",
         "Solver",
         "Weighting",
         "Prefilter",
@@ -332,8 +334,9 @@ def test_run_without_capture_exits_with_4_or_3(
     ],
 )
 def test_choices_in_the_help_are_those_of_the_configuration(name: str) -> None:
-    assert get_args(getattr(options, name))[1].metavar == "|".join(get_args(getattr(config, name)))
-    assert get_args(options.Model)[1].metavar == "|".join(get_args(config.ModelName))
+    choices = getattr(config_sections, name, None) or getattr(config, name)
+    assert get_args(getattr(options, name))[1].metavar == "|".join(get_args(choices))
+    assert get_args(options.Model)[1].metavar == "|".join(get_args(config_sections.ModelName))
 
 
 # --- progress --------------------------------------------------------------------------------------------------------

@@ -37,15 +37,24 @@ WEIGHTED = [name for name, estimator in ESTIMATORS.items() if estimator.weighs]
 
 
 def assert_parameters_equal(b: Bench, found: Estimated, pixels: tuple[tuple[int, int], ...] = PIXELS) -> None:
-    """Parameters in their standard errors, and the noise of the residuals."""
+    """Parameters in their standard errors, and the noise of the residuals.
+
+    Where the texture does not determine the solution, another one takes its place and its error says so: such windows
+    are left out, at least two must be left.
+    """
     limit, problem = tolerance(b.device), found.problem
+    compared = 0
     for pixel in pixels:
-        assert found.status[pixel] == Status.OK
+        assert found.status[pixel] in (Status.OK, Status.INCOHERENT)
         solved, _ = b.solved(*pixel, problem)
         P, cov = solved.at_centre(b.columns, b.sampling, DENOISE[problem.estimator])
         std = np.sqrt([np.diag(cov[k, k]) for k in range(b.columns.n_time_like)])
-        assert np.max(np.abs(found.parameters[pixel] - P.T) / std) <= limit.parameters
         assert found.variance[pixel] == pytest.approx(solved.variance, rel=limit.errors)
+        if "t" in b.columns.solutions and found.map("flow_x")[1][pixel] > 1.01 * std[-1, b.columns.index("x")]:
+            continue
+        assert np.max(np.abs(found.parameters[pixel] - P.T) / std) <= limit.parameters
+        compared += 1
+    assert compared >= 2
 
 
 def motion_of(model: str) -> str | None:

@@ -19,7 +19,19 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("errors", "status", "progress", "trace", "background"), 1),
     **dict.fromkeys(("kernels",), 2),
     **dict.fromkeys(
-        ("capture", "models", "config", "config_values", "geometry", "field", "filters", "sampling", "range_flow"), 3
+        (
+            "capture",
+            "models",
+            "config",
+            "config_sections",
+            "config_values",
+            "geometry",
+            "field",
+            "filters",
+            "sampling",
+            "range_flow",
+        ),
+        3,
     ),
     **dict.fromkeys(("presets", "splines", "refine_plan", "noise"), 3),
     **dict.fromkeys(("synthetic", "metrics"), 3),

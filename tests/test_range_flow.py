@@ -15,7 +15,7 @@ import pytest
 import tifffile
 from reference import chain, estimators
 from reference import range_flow as twin
-from reference.estimators import Cells
+from reference.cells import Cells
 from test_kernels_tensor import relative_error
 from test_pipeline import assert_same, files_of
 from tolerances import tolerance

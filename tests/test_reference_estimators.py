@@ -11,7 +11,8 @@ import conftest
 import numpy as np
 import pytest
 from reference import chain, estimators
-from reference.estimators import PENALTIES, Cells, Level, Schedule
+from reference.cells import Cells
+from reference.estimators import PENALTIES, Level, Schedule
 from reference.sequences import affine_sequence
 from scipy.optimize import minimize
 

@@ -16,13 +16,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import test_estimators
 import test_kernels_tensor
 import test_range_flow
 from reference import chain, patch
 from refine_bench import SCENE, Case, covariance, estimated
+from test_kernels_estimate import assert_maps_equal
 from test_prefilter import assert_equals_twin
 from tolerances import SOLVERS, tolerance
 
+from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.prefilter import PREFILTERS
 from leafflow_ti.status import Status
 
@@ -33,6 +36,10 @@ SYSTEMS = [
     ("depth", "camera", "square", None),
     ("affine-4d", "none", "line-x", "rotation"),
     ("affine-scene-flow", "temporal", "line-x", "acceleration"),
+]
+WEIGHTED = [
+    *(("flow-affine", name) for name, estimator in ESTIMATORS.items() if estimator.weighs),
+    ("affine-scene-flow", "robust-tls"),
 ]
 
 
@@ -53,7 +60,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(PREFILTERS) + 7} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 7} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -100,6 +107,13 @@ def on_vulkan_the_chain_equals_the_twin(
             map_value, map_std = (m[pixel] for m in found.map(name))
             assert abs(map_value - value) <= limit.maps * std, name
             assert map_std == pytest.approx(std, rel=limit.errors), name
+
+
+@pytest.mark.parametrize(("model", "estimator"), WEIGHTED)
+def on_vulkan_windows_weighted_anew_equal_the_twin(bench: Callable, model: str, estimator: str) -> None:
+    b = bench(model, "none", test_estimators.GRIDS[model], "f32")
+    found = b.estimate(test_estimators.motion_of(model), estimator=estimator, robust="all", noise=1.0)
+    assert_maps_equal(b, found)
 
 
 @pytest.mark.parametrize(("size", "stride"), [(31, 3), (37, 4)])

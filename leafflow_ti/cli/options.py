@@ -63,8 +63,8 @@ Depth = Annotated[
 Estimator = Annotated[
     str | None,
     _text(
-        "estimator", "NAME",
-        "ols, tls, tls-equilibrated, sampson, fns, for3, robust-ols, robust-ols-sor or robust-tls [tls-equilibrated].",
+        "estimator", "ols|tls|tls-equilibrated|sampson|fns|for3|robust-ols|robust-ols-sor|robust-tls",
+        "Estimator of the flow parameters [tls-equilibrated].",
     ),
 ]  # fmt: skip
 Scale = Annotated[float | None, _text("scale", "K", "Scale of the coordinates for tls, sampson, fns [1].")]

@@ -45,6 +45,8 @@ class Output(IntEnum):
 
 EXPECTED = 10.0
 """How many times the expected residual leaves no confidence."""
+LEAST_SUPPORT = 0.02
+"""Share of the window below which a robust estimate rests on too little."""
 TINY = 1e-30
 
 
@@ -111,6 +113,11 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         result = ti.select(unsolved, V(not_converged), result)
         largest = value[p.v + Value.MAX_RESIDUAL]
         result = ti.select(excess < half * (2.0 * largest * largest), result, V(incoherent))
+        if number[p.n + Number.REWEIGHTED] == 1:
+            share = ws[region(p, number, Region.SHARE)]
+            ws[target + Output.SUPPORT * p.stride] = ti.min(share, V(1.0))
+            # A fit to next to nothing of the window explains anything.
+            result = ti.select(share < V(LEAST_SUPPORT), V(incoherent), result)
         # The constraint explains nothing: there is nothing but noise, or texture that does not move as one.
         rough = smooth > gradient * value[p.v + Value.ROUGHEST]
         nothing = ti.select(rough, V(incoherent), V(no_structure))
@@ -120,9 +127,6 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         agreement = ti.max(expected - energy, V(0.0)) / ti.max(expected + energy, V(TINY))
         beyond = ti.max(weakest - floor * precise(0.5), V(0.0))
         structure = beyond / ti.max(beyond + energy, V(TINY))
-        if number[p.n + Number.REWEIGHTED] == 1:
-            share = ws[region(p, number, Region.SHARE)]
-            ws[target + Output.SUPPORT * p.stride] = ti.min(share, V(1.0))
         ws[target + Output.CONFIDENCE * p.stride] = agreement * agreement * structure * structure
         ws[target + Output.STATUS * p.stride] = ti.select(mass < V(value[p.v + Value.MIN_MASS]), V(border), result)
 

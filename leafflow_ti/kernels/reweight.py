@@ -20,6 +20,31 @@ LEAST_SHARE = 1e-3
 """Least mean weight of a window: where next to nothing counts, the solution stays as it is."""
 
 
+@ti.dataclass
+class Tables:
+    """Where the tables of a problem's cells begin, see ``stages.cells``: lists in ``number``, the rest in ``value``."""
+
+    firsts: ti.i32  # first term of each entry
+    terms: ti.i32  # x 3: source, powers of the cell's middle along x and y
+    noises: ti.i32  # x 3: row, column, monomial
+    monomials: ti.i32  # x 2: powers
+    factors: ti.i32  # of terms, then of noises
+    noise_factors: ti.i32
+    x: ti.i32  # weights of the cells, those of a narrow window, powers of their middles, mean powers of their samples
+    y: ti.i32
+    n_x: ti.i32  # cells
+    n_y: ti.i32
+    mean: ti.i32  # which of the rows of ``x`` and ``y`` is the first of mean powers
+    entries: ti.i32  # numbers of entries, sources, monomials, noises
+    sources: ti.i32
+    n_monomials: ti.i32
+    n_noises: ti.i32
+
+
+MIDDLE = 2
+"""Which of the rows of ``Tables.x`` and ``y`` is the first of powers of the middles."""
+
+
 @functools.cache
 def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``begin_weights``, ``reweight`` and ``relax``."""
@@ -49,15 +74,32 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         return total
 
     @ti.func
-    def prepare(plain: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+    def tables_of(p: ti.template(), number: ti.template()):
+        """The problem's ``Tables``."""
+        lists = p.n + number[p.n + Number.CELL_LISTS]
+        entries, n_terms = number[p.n + Number.EXTRA], number[p.n + Number.CELL_TERMS]
+        n_noises, n_x = number[p.n + Number.CELL_NOISES], number[p.n + Number.CELLS_X]
+        terms = lists + entries + 1
+        factors = p.v + number[p.n + Number.CELL_VALUES]
+        along_x = factors + n_terms + n_noises
+        degrees = number[lists - 1]
+        return Tables(
+            firsts=lists, terms=terms, noises=terms + 3 * n_terms, monomials=terms + 3 * n_terms + 3 * n_noises,
+            factors=factors, noise_factors=factors + n_terms, x=along_x, y=along_x + (MIDDLE + 2 * degrees) * n_x,
+            n_x=n_x, n_y=number[p.n + Number.CELLS_Y], mean=MIDDLE + degrees, entries=entries,
+            sources=number[p.n + Number.SOURCES], n_monomials=number[p.n + Number.CELL_MONOMIALS], n_noises=n_noises,
+        )  # fmt: skip
+
+    @ti.func
+    def prepare(
+        plain: ti.i32, t: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(),
+        ws: ti.template(),
+    ):  # fmt: skip
         """Mean squared residual and mean relative noise of the solutions, as functions of a cell's sums."""
         n, k = number[p.n + Number.N], number[p.n + Number.SOLUTIONS]
         quadratic, relative = region(p, number, Region.QUADRATIC), region(p, number, Region.RELATIVE)
-        lists, values = p.n + number[p.n + Number.CELL_LISTS], p.v + number[p.n + Number.CELL_VALUES]
-        terms, noises = number[p.n + Number.CELL_TERMS], number[p.n + Number.CELL_NOISES]
-        first_noise = lists + number[p.n + Number.EXTRA] + 1 + 3 * terms
-        small.clear(ws, quadratic, number[p.n + Number.EXTRA], p.stride)
-        small.clear(ws, relative, number[p.n + Number.CELL_MONOMIALS], p.stride)
+        small.clear(ws, quadratic, t.entries, p.stride)
+        small.clear(ws, relative, t.n_monomials, p.stride)
         for j in range(k):
             share = 1.0 / (gauge(j, plain, p, number, value, ws) * ti.cast(k, precise))
             for r in range(n):
@@ -66,12 +108,12 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
                     at = quadratic + number[p.n + Number.LOWER + tri(r, c)] * p.stride
                     twice = ti.select(r == c, precise(1.0), precise(2.0))
                     ws[at] = ws[at] + one * parameter(j, c, p, number, ws) * twice
-            for e in range(noises):
-                r, c = number[first_noise + 3 * e], number[first_noise + 3 * e + 1]
-                at = relative + number[first_noise + 3 * e + 2] * p.stride
+            for e in range(t.n_noises):
+                r, c = number[t.noises + 3 * e], number[t.noises + 3 * e + 1]
+                at = relative + number[t.noises + 3 * e + 2] * p.stride
                 twice = ti.select(r == c, precise(1.0), precise(2.0))
                 both = parameter(j, r, p, number, ws) * parameter(j, c, p, number, ws)
-                ws[at] = ws[at] + both * share * (twice * value[values + terms + e])
+                ws[at] = ws[at] + both * share * (twice * value[t.noise_factors + e])
 
     @ti.func
     def begin_weights(
@@ -85,8 +127,9 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         kind = p.which % AGAIN
         n, k = number[p.n + Number.N], number[p.n + Number.SOLUTIONS]
         moments, quadratic = region(p, number, Region.MOMENTS), region(p, number, Region.QUADRATIC)
-        prepare(ti.cast(kind == Weights.PENALTY_PLAIN, ti.i32), p, number, value, ws)
-        entries = number[p.n + Number.EXTRA]
+        tables = tables_of(p, number)
+        prepare(ti.cast(kind == Weights.PENALTY_PLAIN, ti.i32), tables, p, number, value, ws)
+        entries = tables.entries
         # Means over what is seen of the window, as the residuals of the cells are.
         seen = ti.max(ws[moments + entries * p.stride], V(1e-6))
         residual = small.dot(ws, quadratic, 1, moments, 1, entries, p.stride) / seen
@@ -142,6 +185,60 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         return weight
 
     @ti.func
+    def power(row: ti.i32, x: ti.i32, y: ti.i32, bx: ti.i32, by: ti.i32, t: ti.template(), value: ti.template()):
+        """A cell's entry in the tables along x and y, of the powers (x, y) behind ``row``."""
+        return value[t.x + (row + x) * t.n_x + bx] * value[t.y + (row + y) * t.n_y + by]
+
+    @ti.func
+    def load_cell(
+        at: ti.i32, bx: ti.i32, by: ti.i32, t: ti.template(), p: ti.template(), number: ti.template(),
+        value: ti.template(), ws: ti.template(), J: ti.template(),
+    ):  # fmt: skip
+        """CELL_ENTRIES: the tensor of the cell whose sources begin at ``at``; the weight of its valid samples."""
+        cell, own = region(p, number, Region.CELL), region(p, number, Region.CELL_ENTRIES)
+        for s in range(t.sources):
+            plane = s * number[p.n + Number.SOURCE_PLANE]
+            ws[cell + s * p.stride] = gather(at + plane, number[p.n + Number.CELL_STEP_X], J)
+        window = value[t.x + bx] * value[t.y + by]
+        for e in range(t.entries):
+            total = V(0.0)
+            for term in range(number[t.firsts + e], number[t.firsts + e + 1]):
+                entry = t.terms + 3 * term
+                factor = power(MIDDLE, number[entry + 1], number[entry + 2], bx, by, t, value)
+                total = total + ws[cell + number[entry] * p.stride] * (factor * window * value[t.factors + term])
+            ws[own + e * p.stride] = total
+        return ws[cell + number[p.n + Number.MASS_SOURCE] * p.stride] * window
+
+    @ti.func
+    def relative_noise(
+        bx: ti.i32, by: ti.i32, t: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(),
+        ws: ti.template(),
+    ):  # fmt: skip
+        """Noise of a cell's residual relative to that of the window's."""
+        relative, noise = region(p, number, Region.RELATIVE), V(0.0)
+        for m in range(t.n_monomials):
+            x, y = number[t.monomials + 2 * m], number[t.monomials + 2 * m + 1]
+            noise = noise + ws[relative + m * p.stride] * power(t.mean, x, y, bx, by, t, value)
+        return noise
+
+    @ti.func
+    def add_cell(
+        weight: ti.template(), counted: ti.template(), less: ti.template(), bx: ti.i32, by: ti.i32, t: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(),
+    ):  # fmt: skip
+        """Add a cell to the sums: its tensor by ``weight``, its monomials by that times what is ``counted`` of it, and
+        by ``less``."""
+        sums, own = region(p, number, Region.WEIGHT_SUMS), region(p, number, Region.CELL_ENTRIES)
+        for e in range(t.entries):
+            ws[sums + e * p.stride] = ws[sums + e * p.stride] + ws[own + e * p.stride] * weight
+        one, two = sums + t.entries * p.stride, sums + (t.entries + t.n_monomials) * p.stride
+        for m in range(t.n_monomials):
+            x, y = number[t.monomials + 2 * m], number[t.monomials + 2 * m + 1]
+            mean = power(t.mean, x, y, bx, by, t, value)
+            ws[one + m * p.stride] = ws[one + m * p.stride] + counted * weight * mean
+            ws[two + m * p.stride] = ws[two + m * p.stride] + less * mean
+
+    @ti.func
     def reweight(
         p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
         out: ti.template(),
@@ -149,108 +246,67 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         """Weigh the window's cells by the present solution; ``which``: ``Weights``. Then σ² of the penalty shrinks."""
         kind, narrow = p.which % NARROW, p.which // NARROW
         plain = ti.cast(kind == Weights.PENALTY_PLAIN, ti.i32)
-        prepare(plain, p, number, value, ws)
-        n_x, n_y = number[p.n + Number.CELLS_X], number[p.n + Number.CELLS_Y]
-        terms, monomials = number[p.n + Number.CELL_TERMS], number[p.n + Number.CELL_MONOMIALS]
-        entries, sources = number[p.n + Number.EXTRA], number[p.n + Number.SOURCES]
-        noises = number[p.n + Number.CELL_NOISES]
-        lists = p.n + number[p.n + Number.CELL_LISTS]
-        first_term = lists + entries + 1
-        powers_at = first_term + 3 * terms + 3 * noises
-        # Weights, narrow weights, powers of the middles, mean powers; along x, then along y.
-        along_x = p.v + number[p.n + Number.CELL_VALUES] + terms + noises
-        degrees = number[lists - 1]
-        along_y = along_x + (2 + 2 * degrees) * n_x
-        sums, cell = region(p, number, Region.WEIGHT_SUMS), region(p, number, Region.CELL)
-        noise_sums = sums + entries * p.stride
-        own, relative = region(p, number, Region.CELL_ENTRIES), region(p, number, Region.RELATIVE)
-        quadratic = region(p, number, Region.QUADRATIC)
+        t = tables_of(p, number)
+        prepare(plain, t, p, number, value, ws)
+        small.clear(ws, region(p, number, Region.WEIGHT_SUMS), t.entries + 2 * t.n_monomials, p.stride)
         squared = ws[region(p, number, Region.SCALE_SQUARED)]
+        quadratic, own = region(p, number, Region.QUADRATIC), region(p, number, Region.CELL_ENTRIES)
         row = p.pixel // number[p.n + Number.PITCH]
         column = p.pixel - row * number[p.n + Number.PITCH]
-        step, pitch = number[p.n + Number.CELL_STEP_X], number[p.n + Number.SOURCE_PITCH]
-        corner = number[p.n + Number.SOURCES_AT] + row * number[p.n + Number.CELL_STEP_Y] * pitch + column * step
-        small.clear(ws, sums, entries + 2 * monomials, p.stride)
+        pitch = number[p.n + Number.SOURCE_PITCH]
+        corner = number[p.n + Number.SOURCES_AT] + row * number[p.n + Number.CELL_STEP_Y] * pitch
+        corner += column * number[p.n + Number.CELL_STEP_X]
         mass, weighted, alone, spread = V(0.0), V(0.0), V(0.0), V(0.0)
-        for by in range(n_y):
-            for bx in range(n_x):
-                at = corner + by * pitch + bx
-                for s in range(sources):
-                    ws[cell + s * p.stride] = gather(at + s * number[p.n + Number.SOURCE_PLANE], step, J)
-                window = value[along_x + bx] * value[along_y + by]
-                counted = ws[cell + number[p.n + Number.MASS_SOURCE] * p.stride] * window
-                noise = V(0.0)
-                for m in range(monomials):
-                    x, y = number[powers_at + 2 * m], number[powers_at + 2 * m + 1]
-                    mean = value[along_x + (2 + degrees + x) * n_x + bx] * value[along_y + (2 + degrees + y) * n_y + by]
-                    noise = noise + ws[relative + m * p.stride] * mean
-                if plain == 1:
-                    noise = V(1.0)
-                for e in range(entries):
-                    total = V(0.0)
-                    for t in range(number[lists + e], number[lists + e + 1]):
-                        x, y = number[first_term + 3 * t + 1], number[first_term + 3 * t + 2]
-                        power = value[along_x + (2 + x) * n_x + bx] * value[along_y + (2 + y) * n_y + by]
-                        factor = window * power * value[p.v + number[p.n + Number.CELL_VALUES] + t]
-                        total = total + ws[cell + number[first_term + 3 * t] * p.stride] * factor
-                    ws[own + e * p.stride] = total
+        for by in range(t.n_y):
+            for bx in range(t.n_x):
+                counted = load_cell(corner + by * pitch + bx, bx, by, t, p, number, value, ws, J)
+                noise = V(1.0)
+                if plain == 0:
+                    noise = relative_noise(bx, by, t, p, number, value, ws)
                 some = counted > V(0.0)
-                inverse = 1.0 / ti.max(noise, V(1e-6))
-                weight, second = inverse, V(0.0)
+                weight, less = 1.0 / ti.max(noise, V(1e-6)), V(0.0)
                 if kind != Weights.NOISE:
-                    residual = small.dot(ws, quadratic, 1, own, 1, entries, p.stride)
+                    residual = small.dot(ws, quadratic, 1, own, 1, t.entries, p.stride)
                     residual = residual / ti.select(some, counted, V(1.0))
                     if kind == Weights.FUNDAMENTAL:
-                        second = residual * inverse * inverse
+                        less = counted * residual * weight * weight
                     else:
-                        weight = inverse * penalise(residual * inverse / squared, number[p.n + Number.PENALTY])
+                        weight = weight * penalise(residual * weight / squared, number[p.n + Number.PENALTY])
                 if narrow == 1:
-                    weight = weight * (value[along_x + n_x + bx] * value[along_y + n_y + by])
+                    weight = weight * (value[t.x + t.n_x + bx] * value[t.y + t.n_y + by])
                 weight = ti.select(some, weight, V(0.0))
-                for e in range(entries):
-                    ws[sums + e * p.stride] = ws[sums + e * p.stride] + ws[own + e * p.stride] * weight
-                for m in range(monomials):
-                    x, y = number[powers_at + 2 * m], number[powers_at + 2 * m + 1]
-                    mean = value[along_x + (2 + degrees + x) * n_x + bx] * value[along_y + (2 + degrees + y) * n_y + by]
-                    one, two = noise_sums + m * p.stride, noise_sums + (monomials + m) * p.stride
-                    ws[one] = ws[one] + weight * counted * mean
-                    ws[two] = ws[two] + second * counted * mean
+                add_cell(weight, counted, less, bx, by, t, p, number, value, ws)
                 mass = mass + counted
                 weighted = weighted + weight * counted
                 alone = alone + counted * counted
                 spread = spread + weight * weight * noise * counted * counted
-        store(mass, weighted, alone, spread, p, number, value, ws)
+        store(mass, weighted, alone, spread, t, p, number, value, ws)
         shrunk = squared * value[p.v + Value.SCALE_SHRINK]
         ws[region(p, number, Region.SCALE_SQUARED)] = ti.max(shrunk, ws[region(p, number, Region.LEAST_SQUARED)])
 
     @ti.func
     def store(
-        mass: ti.template(), weighted: ti.template(), alone: ti.template(), spread: ti.template(), p: ti.template(),
-        number: ti.template(), value: ti.template(), ws: ti.template(),
+        mass: ti.template(), weighted: ti.template(), alone: ti.template(), spread: ti.template(), t: ti.template(),
+        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(),
     ):  # fmt: skip
         """What the weights made of tensor and noise, in the pixels that are weighted anew."""
-        n, entries = number[p.n + Number.N], number[p.n + Number.EXTRA]
-        monomials, noises = number[p.n + Number.CELL_MONOMIALS], number[p.n + Number.CELL_NOISES]
-        terms = number[p.n + Number.CELL_TERMS]
-        first_noise = p.n + number[p.n + Number.CELL_LISTS] + entries + 1 + 3 * terms
-        factors = p.v + number[p.n + Number.CELL_VALUES] + terms
+        n = number[p.n + Number.N]
         sums, moments = region(p, number, Region.WEIGHT_SUMS), region(p, number, Region.MOMENTS)
-        noise_sums = sums + entries * p.stride
         noise, active = region(p, number, Region.WEIGHT_NOISE), ws[region(p, number, Region.ACTIVE)] > V(0.5)
         enough = active & (weighted > mass * LEAST_SHARE)
         grown = mass / ti.select(enough, weighted, V(1.0))
-        for e in range(entries):
+        for e in range(t.entries):
             at = moments + e * p.stride
             ws[at] = ti.select(enough, ws[sums + e * p.stride] * grown, ws[at])
         for e in range(n * (n + 1) // 2):
             at = noise + e * p.stride
             ws[at] = ti.select(enough, V(0.0), ws[at])
         # The fundamental scheme takes the sums with the residuals off instead.
-        other = ti.select(p.which == Weights.FUNDAMENTAL, monomials, 0)
-        for e in range(noises):
-            entry = first_noise + 3 * e
+        first = t.entries + ti.select(p.which == Weights.FUNDAMENTAL, t.n_monomials, 0)
+        for e in range(t.n_noises):
+            entry = t.noises + 3 * e
             at = noise + tri(number[entry], number[entry + 1]) * p.stride
-            found = ws[noise_sums + (other + number[entry + 2]) * p.stride] * (grown * value[factors + e])
+            found = ws[sums + (first + number[entry + 2]) * p.stride] * (grown * value[t.noise_factors + e])
             ws[at] = ws[at] + ti.select(enough, found, V(0.0))
         share, more = region(p, number, Region.SHARE), region(p, number, Region.SPREAD)
         ws[share] = ti.select(enough, 1.0 / grown, ws[share])
