@@ -41,8 +41,8 @@ RIGHT = AffineFlow((-0.3, -0.5), ((-0.003, 0.004), (-0.005, 0.003)))
 
 @dataclass(frozen=True)
 class Settings:
-    """Pixels up to ``reach`` px from the line, in ``rows`` rows, over ``seeds``; ``near`` px: where a window of half
-    that many pixels would still see both sides."""
+    """Pixels up to ``reach`` px from the line, more than half a window, in ``rows`` rows, over ``seeds``. ``near`` px:
+    where a window of half that size would still see both sides."""
 
     noise: float = 2.5
     window: int = 33
@@ -98,7 +98,7 @@ def _figures(settings: Settings, found: dict[str, Array], distance: Array) -> li
 
 
 def run_settings(settings: Settings, out: Path) -> Outcome:
-    """Both figures. What is printed are orderings: the Lorentzian is best, the joint fit worse than translation first."""
+    """Both figures. Orderings are printed: the Lorentzian is best, the joint fit worse than translation first."""
     found = {label: errors(settings, options) for label, options in CURVES.items()}
     for label, schedule in SCHEDULES.items():
         with replaced("robust-tls", schedule):
@@ -119,4 +119,4 @@ def run_settings(settings: Settings, out: Path) -> Outcome:
 
 def run(options: Options) -> Outcome:
     """The case; quick: few rows and columns, one sequence."""
-    return run_settings(Settings(reach=8, rows=5, near=4, seeds=1) if options.quick else Settings(), options.out)
+    return run_settings(Settings(reach=20, rows=3, seeds=1) if options.quick else Settings(), options.out)

@@ -118,7 +118,7 @@ def run_settings(settings: Settings, out: Path) -> Outcome:
     )
     notes = (
         "the printed panels are not at hand: orderings are compared, not values",
-        "the project's fns begins with tls-equilibrated, which does not know k; begun with tls, it fails where that does",
+        "fns here begins with tls-equilibrated, which does not know k; begun with tls, it fails where that does",
     )
     return Outcome(tuple(f for panel in panels for f in _figures(panel)), asdict(settings), notes, (picture,))
 
