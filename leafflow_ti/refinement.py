@@ -46,9 +46,12 @@ def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArra
     returns what it took.
 
     Texture in one direction alone (aperture) does not determine the motion, and the noise in the texture's gradient
-    would pass for what does: such pixels keep what the model says. ``maps`` hold what the model gives; those that only
-    the refinement gives are there, too, and not looked at.
+    would pass for what does: such pixels keep what the model says. So do those where a robust estimator had to choose
+    between surfaces (``support`` below 1): the refinement takes all of the window as one, and would mix them again.
+    ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at.
     """
+    if "support" in maps:
+        status[(status == Status.OK) & (maps["support"] < 1)] = Status.UNREFINED
     rows, cols = np.nonzero((status == Status.OK) & np.isfinite(maps["depth"]))
     if not rows.size:
         return Effort()

@@ -32,7 +32,8 @@ ADVICE: dict[Status, str] = {
     Status.BORDER: "the window reaches beyond an image: a smaller one, or --border clip, measures closer to the edge",
     Status.MASKED: "outside the given mask",
     Status.NOT_FINITE: "the images hold NaN or infinite grey values here",
-    Status.UNREFINED: "the exact refinement did not converge or fitted no better: the values are those before it",
+    Status.UNREFINED: "the exact refinement did not converge, fitted no better, or would mix surfaces that a robust "
+    "estimate told apart: the values are those before it",
     Status.NOT_COMPUTED: "not computed yet, or outside the region of interest",
 }
 """One sentence of advice for each status."""

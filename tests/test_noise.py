@@ -93,8 +93,8 @@ def test_noise_variance_is_found(make_bench: Callable, estimator: str) -> None:
 
 @pytest.mark.parametrize("estimator", ["ols", "tls-equilibrated", "for3"])
 def test_error_bars_where_windows_are_cut_off(estimator: str) -> None:
-    """A quarter of the window is left at a corner, half at an edge. 40 samples of 4 neighbours know a standard deviation
-    to some 11 %; at the edge, where the window is lopsided, the approximations leave bars up to 30 % too large."""
+    """A quarter of the window is left at a corner, half at an edge. 40 samples of 4 neighbours know a standard
+    deviation to some 11 %; at the edge, where the window is lopsided, bars are up to 30 % too large."""
     clean = affine_sequence(np.array([[0.3, 0.0, 0.0], [-0.2, 0.0, 0.0]]), 5, (44, 44), noise=0.0, seed=1)
     found = []
     for seed in range(40):

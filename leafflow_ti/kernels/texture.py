@@ -24,7 +24,7 @@ def texture_functions(spec: KernelSpec) -> SimpleNamespace:
         """The factor ρ of the noise that filters leave: the share of the gradient's energy that survives one more
         smoothing.
 
-        Where only a part of the window is seen the residual's variance, by the noise of a whole one, is too small by it.
+        Where only a part of the window is seen, the residual's variance by the noise of a whole one is too small by it.
         """
         energy = region(p, number, Region.MOMENTS) + (number[p.n + Number.EXTRA] + 1) * p.stride
         seen, plain, smooth = ws[energy - p.stride], ws[energy], ws[energy + p.stride]
