@@ -22,14 +22,19 @@ def texture_functions(spec: KernelSpec) -> SimpleNamespace:
     @ti.func
     def smoothness(p: ti.template(), number: ti.template(), ws: ti.template()):
         """The factor ρ of the noise that filters leave: the share of the gradient's energy that survives one more
-        smoothing."""
+        smoothing.
+
+        Where only a part of the window is seen the residual's variance, by the noise of a whole one, is too small by it.
+        """
         energy = region(p, number, Region.MOMENTS) + (number[p.n + Number.EXTRA] + 1) * p.stride
-        plain, smooth = ws[energy], ws[energy + p.stride]
+        seen, plain, smooth = ws[energy - p.stride], ws[energy], ws[energy + p.stride]
         some = plain > V(0.0)
         share = ti.select(some, ti.min(smooth / ti.select(some, plain, V(1.0)), V(1.0)), V(1.0))
         if number[p.n + Number.REWEIGHTED] == 1:
             # The same noise, by fewer or more unequal samples.
             share = share * ws[region(p, number, Region.SPREAD)]
+        else:
+            share = share / ti.max(seen, V(1e-6))
         return share
 
     @ti.func

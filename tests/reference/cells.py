@@ -51,11 +51,16 @@ class Cells:
 
 
 def window(images, sampling: Sampling, columns: ColumnSet, at, valid, cells):
-    """J [N, N] or, with ``cells``, the cells of the window around the pixel ``at`` (x, y), and ρ."""
+    """J [N, N] or, with ``cells``, the cells of the window around the pixel ``at`` (x, y), and ρ.
+
+    With J, ρ over the share of the window that is seen: by so much the variance of its residual is too small.
+    """
     rho = chain.texture_smoothness(images, sampling, *at)
     if cells:
         return Cells.at(images, sampling, columns, at, valid), rho
-    return chain.structure_tensor(images, sampling, columns, [at], valid)[0], rho
+    _, seen = chain.window_of(images, sampling, columns, at, valid)
+    share = float(np.sum(chain.window_weights(sampling) * seen))
+    return chain.structure_tensor(images, sampling, columns, [at], valid)[0], rho / share
 
 
 def noise_vectors(sampling: Sampling, columns: ColumnSet):
