@@ -48,7 +48,9 @@ def draw_curves(path: Path, panels: Sequence[Curves], columns: int = 2) -> Path:
             _draw(axes, panel, labels, handles)
         for axes in grid[len(panels) :]:
             axes.set_axis_off()
-        figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, frameon=False)
+        figure.legend(
+            list(handles.values()), list(handles), loc="outside lower center", ncols=2 * columns, frameon=False
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=110)
     return path

@@ -129,7 +129,7 @@ def run_settings(settings: Settings, out: Path) -> Outcome:
                     within.setdefault(f"{estimator}, {which[-1]} std", []).append(_mean(shares, which))
         panels.append(
             Curves(
-                model, "noise [grey values]", "share of the errors", settings.noises, within, True, limits=(0.4, 1.0)
+                model, "noise [grey values]", "share of the errors", settings.noises, within, True, limits=(0.0, 1.0)
             )
         )
     return Outcome(tuple(figures), asdict(settings), (), (draw_curves(out / "estimators-coverage.png", panels),))
