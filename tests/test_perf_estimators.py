@@ -130,6 +130,17 @@ def test_density_errors_take_the_best_pixels_first() -> None:
     assert yosemite.density_errors(error, -error)[-1] == pytest.approx(50.0)
 
 
+def test_pixels_without_a_value_take_the_nearest() -> None:
+    flow = np.full((3, 5, 2), np.nan)
+    flow[1, 1], flow[1, 4], flow[0, 0] = (1.0, 2.0), (3.0, 4.0), (9.0, 9.0)
+    ground = np.ones((3, 5), np.bool_)
+    ground[0] = False  # values there are not taken either
+    full = yosemite.filled(flow, ground)
+    assert np.isnan(full[0]).all()
+    np.testing.assert_array_equal(full[1:, :3], np.broadcast_to([1.0, 2.0], (2, 3, 2)))
+    np.testing.assert_array_equal(full[1:, 3:], np.broadcast_to([3.0, 4.0], (2, 2, 2)))
+
+
 @pytest.mark.skipif(absent(yosemite.NAME) is not None, reason="the sequence is not there")
 def test_filters_and_best_of_yosemite(tmp_path: Path) -> None:
     table = filters.run_settings(filters.Settings(("tls-equilibrated",), 8), tmp_path)

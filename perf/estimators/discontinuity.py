@@ -88,7 +88,7 @@ def _label(penalty: str, schedule: str) -> str:
 
 
 def _figures(settings: Settings, found: dict[str, Array], distance: Array) -> list[Figure]:
-    """Errors near the line; limits where an ordering is printed."""
+    """Errors near the line; where an ordering is printed the limit is what was measured of the others."""
     near = _shares(found, np.abs(distance) < settings.near)
     far = _shares(found, np.abs(distance) > settings.window // 2)
     limits: dict[str, tuple[float | None, float | None]] = {}
@@ -105,7 +105,7 @@ def _figures(settings: Settings, found: dict[str, Array], distance: Array) -> li
             f"within {settings.near} px of the line: {label}",
             f"beyond {settings.window // 2} px {far[label]:.3g}",
         )
-        figures.append(Figure(name, near[label], "deg", high, "printed", low, note))
+        figures.append(Figure(name, near[label], "deg", high, "goal", low, note))
     return figures
 
 
