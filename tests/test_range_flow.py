@@ -110,13 +110,13 @@ def estimated(device: Device, constraint: str, terms: str, **options: Any) -> tu
     J = np.zeros((BAND.rows, BAND.cols, columns.n, columns.n))
     J[..., *np.tril_indices(columns.n)] = np.moveaxis(planes[list(layout.lower)], 0, -1)
     J += np.swapaxes(np.tril(J, -1), -1, -2)
-    return problem, J, planes[-2] / planes[-3], maps
+    return problem, J, planes[-2] / planes[-3], planes[-4], maps
 
 
 def check(device: Device, constraint: str, terms: str, estimator: str, **options: Any) -> None:
     from leafflow_ti.kernels.maps import Output
 
-    problem, J, rho, maps = estimated(device, constraint, terms, estimator=estimator, **options)
+    problem, J, rho, seen, maps = estimated(device, constraint, terms, estimator=estimator, **options)
     columns = problem.columns
     images, depth, noise = inputs(constraint == "taylor")
     limit = tolerance(device)
@@ -132,7 +132,7 @@ def check(device: Device, constraint: str, terms: str, estimator: str, **options
         if ESTIMATORS[estimator].weighs:
             solved = estimators.estimate(Cells.of(*window, SAMPLING, columns), problem).solved(rho[row, col])
         else:
-            solved = chain.Solved.of(wanted, rho[row, col], columns, SAMPLING, estimator)
+            solved = chain.Solved.of(wanted, rho[row, col] / seen[row, col], columns, SAMPLING, estimator)
         x0, y0 = x - SCENE.principal[0], y - SCENE.principal[1]
         N, cov, light, spread = twin.velocity(
             solved, columns, SAMPLING, DENOISE[estimator], SCENE.f_px, WORKING, x0, y0

@@ -90,7 +90,7 @@ def test_static_scenes_have_no_motion() -> None:
         found = plan(still, model="depth", refine=3)
         assert found.refine is not None
         assert (found.refine.frames, found.refine.unknowns) == ((0,), 3)
-        assert found.quantities == ("disparity", "depth", "slope_x", "slope_y")
+        assert found.quantities == ("disparity", "depth", "slope_x", "slope_y", "confidence", "identified")
 
 
 @pytest.mark.parametrize(
