@@ -241,7 +241,7 @@ class Bench:
 
         def solve(J: Any, rho: float, sampling: Sampling, columns: ColumnSet) -> chain.Solved:
             if weighed:
-                return weighted.estimate(J, problem).solved(rho)
+                return weighted.estimate(J, problem).solved(rho, ESTIMATORS[problem.estimator].biased)
             return chain.Solved.of(J, rho, columns, sampling, problem.estimator, problem.scale)
 
         weighed = ESTIMATORS[problem.estimator].weighs

@@ -130,7 +130,8 @@ def check(device: Device, constraint: str, terms: str, estimator: str, **options
         assert relative_error(J[row, col], wanted) <= 2 * limit.tensor
         assert maps[Output.STATUS, row, col] == Status.OK
         if ESTIMATORS[estimator].weighs:
-            solved = estimators.estimate(Cells.of(*window, SAMPLING, columns), problem).solved(rho[row, col])
+            weighted = estimators.estimate(Cells.of(*window, SAMPLING, columns), problem)
+            solved = weighted.solved(rho[row, col], ESTIMATORS[estimator].biased)
         else:
             solved = chain.Solved.of(wanted, rho[row, col] / seen[row, col], columns, SAMPLING, estimator)
         x0, y0 = x - SCENE.principal[0], y - SCENE.principal[1]

@@ -114,6 +114,13 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
             for c in range(r + 1):
                 one, two = target + r * p.stride, product + c * p.stride
                 ws[cov + tri(r, c) * p.stride] = small.dot(ws, one, n_rows, two, n_rows, flow, p.stride) * factor
+        if number[p.n + Number.BIASED] == 1:
+            bias, work = region(p, number, Region.BIAS) + p.which * flow * p.stride, region(p, number, Region.VECTORS)
+            for r in range(n_rows):
+                one = small.dot(ws, target + r * p.stride, n_rows, bias, 1, flow, p.stride)
+                ws[work + r * p.stride] = one
+                for c in range(r + 1):
+                    ws[cov + tri(r, c) * p.stride] = ws[cov + tri(r, c) * p.stride] + one * ws[work + c * p.stride]
         identify.admit(target, rows_at, n_rows, cov, p, number, value, ws)
 
     @ti.func

@@ -312,6 +312,25 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
             at = region(p, number, Region.VARIANCE) + j * p.stride
             own = images + j * p.stride
             ws[at] = small.dot(ws, own, k, own, k, n, p.stride) / ws[at]
+            if number[p.n + Number.BIASED] == 1:
+                keep_bias(j, k, p, number, value, ws)
+
+    @ti.func
+    def keep_bias(
+        j: ti.i32, k: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
+    ):
+        """``S σ² N_ff p``: what noise adds to J_ff, times solution j, whose scaled entries are in VECTORS."""
+        flow, noise = number[p.n + Number.FLOW], region(p, number, Region.WEIGHT_NOISE)
+        vectors, variance = region(p, number, Region.VECTORS), ws[region(p, number, Region.VARIANCE) + j * p.stride]
+        for r in range(flow):
+            total = V(0.0)
+            for c in range(flow):
+                element = V(ti.select(r == c, value[p.v + Value.NOISE + r], precise(0.0)))
+                if number[p.n + Number.REWEIGHTED] == 1:
+                    element = ws[noise + tri(ti.max(r, c), ti.min(r, c)) * p.stride]
+                total = total + element * ws[vectors + (c * k + j) * p.stride] * value[p.v + Value.SCALE + c]
+            at = region(p, number, Region.BIAS) + (j * flow + r) * p.stride
+            ws[at] = total * variance * value[p.v + Value.SCALE + r]
 
     @ti.func
     def centre(

@@ -74,6 +74,7 @@ class Region(IntEnum):
     LEFT = auto()  # [3, G + F, Q]: by the errors of the geometry, of the reference's normal equations
     RIGHT = auto()  # [3, G + F, Q]: what is correlated with them
     REFERENCE_VARIANCE = auto()  # [1]
+    BIAS = auto()  # [k, F]: of the scaled normal equations, by the noise of their columns; empty without one
     ACTIVE = auto()  # [1]: 1 where the window is weighted anew; from here on: empty unless windows are
     SPREAD = auto()  # [1]: what the weights make of the variance of the normal equations' noise
     SHARE = auto()  # [1]: mean weight
@@ -96,7 +97,8 @@ class Layout:
 
     ``moments``: planes of the largest tensor. ``rows_t`` and ``motion``: the largest numbers of motion rows and of
     equations of any camera. ``unknowns`` of the motion fit; ``correlated``: columns whose noise cameras share;
-    ``maps``: output planes; ``sources``, ``monomials``: of the largest cell where windows are weighted anew, else 0.
+    ``maps``: output planes; ``sources``, ``monomials``: of the largest cell where windows are weighted anew, else 0;
+    ``biased``: solutions are, by the noise of all columns but the time-like ones.
     """
 
     n: int
@@ -111,6 +113,7 @@ class Layout:
     maps: int
     sources: int = 0
     monomials: int = 0
+    biased: bool = False
 
     @property
     def sizes(self) -> dict[Region, int]:
@@ -174,6 +177,7 @@ class Layout:
             Region.LEFT: 3 * errors * q,
             Region.RIGHT: 3 * errors * q,
             Region.REFERENCE_VARIANCE: 1,
+            Region.BIAS: k * flow * int(self.biased),
             Region.ACTIVE: anew,
             Region.SPREAD: anew,
             Region.SHARE: anew,
@@ -234,6 +238,7 @@ class Number(IntEnum):
     OUT_Y = auto()
     STEP = auto()
     PITCH = auto()
+    BIASED = auto()  # what the noise of the columns does to solutions counts among their errors
     REWEIGHTED = auto()  # windows are weighted anew; what begins with CELL or SOURCE means something only then
     ROBUST = auto()  # rows of own flows that contradict the reference's are left out
     EVERYWHERE = auto()  # in every pixel, else where the plain fit failed

@@ -149,7 +149,7 @@ class ProblemTables:
             max(problem.fitted, problem.unknowns + bool(own and own.growth), 3 if problem.range_scale else 1),
             columns.n_flow if own and own.reference_rows else 0, Output.PLANES,
             max((len(c.sources) for c in self._cells), default=0),
-            max((len(c.monomials) for c in self._cells), default=0),
+            max((len(c.monomials) for c in self._cells), default=0), self._estimator.biased,
         )  # fmt: skip
         self.reference = self._with_cells(self._reference_tables(rows, layout), 0)
         self.tables = [self.reference]
@@ -343,7 +343,9 @@ class ProblemTables:
         problem = self.problem
         own = problem.own_flows
         compared = self._estimator.robust and own is not None and own.reference_rows
-        self._set_numbers(tables.number, REWEIGHTED=len(self._cells) > 0, ROBUST=compared)
+        self._set_numbers(
+            tables.number, REWEIGHTED=len(self._cells) > 0, ROBUST=compared, BIASED=self._estimator.biased
+        )
         if not self._cells:
             return tables
         cells, planes = self._cells[min(request, 1)], self._sources[request]

@@ -153,7 +153,7 @@ class Solved:
 
     ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
     the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
-    ``anew``: the window was weighted anew.
+    ``anew``: the window was weighted anew; ``biased``: by the noise of all columns but the time-like ones, towards 0.
     """
 
     J: np.ndarray
@@ -162,11 +162,13 @@ class Solved:
     noise: np.ndarray
     rho: float
     anew: bool = False
+    biased: bool = False
 
     @classmethod
     def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
         """By one of the estimators without weights, see ``solve``."""
-        return cls(J, *solve(J, columns, sampling, estimator, scale), np.diag(column_noise(sampling, columns)), rho)
+        noise = np.diag(column_noise(sampling, columns))
+        return cls(J, *solve(J, columns, sampling, estimator, scale), noise, rho, biased=estimator == "ols")
 
     def clean(self, denoise):
         """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""
@@ -187,6 +189,9 @@ class Solved:
                     for term in cross_noise(sampling, columns, one, two):
                         M[term.a, term.b] = self.J[term.base_a, term.base_b] * term.value
                 cov[i, j] = self.rho * np.sqrt(self.variance[i] * self.variance[j]) * inverse @ M @ inverse
+                if i == j and self.biased:
+                    bias = inverse @ (self.variance[i] * self.noise[:n, :n] @ self.P[:, i])
+                    cov[i, i] += np.outer(bias, bias)
         return cov
 
     def at_centre(self, columns: ColumnSet, sampling: Sampling, denoise):

@@ -51,11 +51,11 @@ class Found:
         """Whether cells have weights of their own."""
         return bool(np.any(self.weights != 1))
 
-    def solved(self, rho):
-        """What covariances follow from; ``rho`` is the smoothness of the texture."""
+    def solved(self, rho, biased):
+        """What covariances follow from; ``rho`` is the smoothness of the texture, ``biased`` see ``chain.Solved``."""
         p = full(self.P)
         variance = np.einsum("ik,ij,jk->k", p, self.M, p) / np.einsum("ik,ij,jk->k", p, self.N, p)
-        return chain.Solved(self.M, self.P, variance, self.N, rho * self.spread, self.anew)
+        return chain.Solved(self.M, self.P, variance, self.N, rho * self.spread, self.anew, biased)
 
 
 def full(P):

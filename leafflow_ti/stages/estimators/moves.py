@@ -26,6 +26,7 @@ class Estimator:
     """``moves``: a function of the solver ("fast" or "jacobi"). They leave parameters, residual variances and the
     factor of the equilibrated tensor in the workspace.
 
+    ``biased``: the noise of the columns pulls solutions towards 0, which counts among their errors.
     ``weighs``: windows are weighted anew; ``robust``: by their residuals. ``denoise``: share of the gradients' own
     noise that the covariances take out of J_ff; none where J_ff is divided by as it is, or where the residual is no
     bound for the eigenvalues of the equilibrated tensor. What noise adds to J_ff is no structure: taking nearly all of
@@ -36,6 +37,7 @@ class Estimator:
     weighs: bool = False
     denoise: float = 0.9
     robust: bool = False
+    biased: bool = False
 
 
 def null_space(solver: str, raw: bool = False, which: int = 0, whitened: bool = False) -> list[Move]:

@@ -16,4 +16,4 @@ def _moves(solver: str) -> list[Move]:
     return [Move(Stage.LOAD), *least_squares(), *finished(factored=True)]
 
 
-OLS = Estimator(_moves, denoise=0.0)
+OLS = Estimator(_moves, denoise=0.0, biased=True)

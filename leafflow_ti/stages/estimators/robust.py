@@ -51,6 +51,6 @@ def _tls(solver: str) -> list[Move]:
     return _graduated(Weights.PENALTY, null_space(solver), first, full)
 
 
-ROBUST_OLS = Estimator(_ols, weighs=True, denoise=0.0, robust=True)
-ROBUST_OLS_SOR = Estimator(_sor, weighs=True, denoise=0.0, robust=True)
+ROBUST_OLS = Estimator(_ols, weighs=True, denoise=0.0, robust=True, biased=True)
+ROBUST_OLS_SOR = Estimator(_sor, weighs=True, denoise=0.0, robust=True, biased=True)
 ROBUST_TLS = Estimator(_tls, weighs=True, robust=True)
