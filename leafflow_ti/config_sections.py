@@ -78,7 +78,7 @@ class ModelSection(Section):
     estimator: Estimator = "tls-equilibrated"
     solver: Solver = "fast"
     scale: _Width = 1.0
-    penalty: Penalty = "lorentzian"
+    penalty: Penalty = "geman-mcclure"
     robust: Robust = "failed"
     weighting: Weighting = "wls"
     noise: _Noise = "auto"

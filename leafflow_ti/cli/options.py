@@ -70,7 +70,7 @@ Estimator = Annotated[
 Scale = Annotated[float | None, _text("scale", "K", "Scale of the coordinates for tls, sampson, fns [1].")]
 Penalty = Annotated[
     str | None,
-    _text("penalty", "lorentzian|geman-mcclure|truncated", "Robust estimators: how residuals count [lorentzian]."),
+    _text("penalty", "lorentzian|geman-mcclure|truncated", "Robust estimators: how residuals count [geman-mcclure]."),
 ]
 Robust = Annotated[
     str | None, _text("robust", "failed|all", "Robust estimators: pixels whose plain fit failed, or all [failed].")

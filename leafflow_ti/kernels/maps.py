@@ -45,7 +45,7 @@ class Output(IntEnum):
 
 EXPECTED = 10.0
 """How many times the expected residual leaves no confidence."""
-LEAST_SUPPORT = 0.02
+LEAST_SUPPORT = 0.01
 """Share of the window below which a robust estimate rests on too little."""
 TINY = 1e-30
 
@@ -78,7 +78,8 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         With the noise level known, that much of the residual is no sign of incoherence, up to half of it: the level may
         be that of a fine texture. The confidence is that of (2.18), ((τ - λ) / (τ + λ))² for residual variances λ < τ,
         τ being ``EXPECTED`` times what noise and the model's own misfit amount to, times ``(s / (s + e))²`` with s the
-        least energy of the gradient in any direction beyond its noise, and e the energy of the residual.
+        least energy of the gradient in any direction beyond its noise, and e the energy of the residual; and times the
+        support of a window that was weighted anew, whose residual is small by what was left out.
         """
         found, target = region(p, number, Region.PARAMETERS), region(p, number, Region.OUT)
         xx, xy, yy = texture.gradient(p, number, ws)
@@ -127,7 +128,10 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         agreement = ti.max(expected - energy, V(0.0)) / ti.max(expected + energy, V(TINY))
         beyond = ti.max(weakest - floor * precise(0.5), V(0.0))
         structure = beyond / ti.max(beyond + energy, V(TINY))
-        ws[target + Output.CONFIDENCE * p.stride] = agreement * agreement * structure * structure
+        confidence = agreement * agreement * structure * structure
+        if number[p.n + Number.REWEIGHTED] == 1:
+            confidence = confidence * ws[target + Output.SUPPORT * p.stride]
+        ws[target + Output.CONFIDENCE * p.stride] = confidence
         ws[target + Output.STATUS * p.stride] = ti.select(mass < V(value[p.v + Value.MIN_MASS]), V(border), result)
 
     @ti.func

@@ -58,7 +58,7 @@ class Problem:
     range_scale: tuple[float, float] | None = None
     noise: float = 0.0
     scale: float = 1.0
-    penalty: str = "lorentzian"
+    penalty: str = "geman-mcclure"
     robust: str = "failed"
 
     def requests(self, layout: TensorLayout) -> tuple[Request, ...]:
