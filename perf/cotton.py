@@ -145,7 +145,7 @@ def figures_of(label: str, field: Field, truth: Truth) -> tuple[Figure, ...]:
         ),
         Figure(
             f"median normal error, {label}",
-            float(np.median(tilt[known])),
+            float(np.nanmedian(tilt[known])),
             "deg",
             note="truth: differences of the depth map",
         ),
