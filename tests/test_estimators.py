@@ -33,6 +33,8 @@ GRIDS = {
 }  # fmt: skip
 """A grid for every model; all but ``range-flow``, whose images are others: see ``test_range_flow``."""
 ROBUST = [name for name in ESTIMATORS if name.startswith("robust")]
+MILD = {"penalty": "lorentzian"}
+"""The penalty that forgets nothing: half way between two motions rounding decides which one the others forget."""
 WEIGHTED = [name for name, estimator in ESTIMATORS.items() if estimator.weighs]
 
 
@@ -82,7 +84,7 @@ def test_maps_and_parameters_equal_the_twin(bench: Callable, model: str, estimat
 )
 def test_with_brightness(bench: Callable, model: str, brightness: str, grid: str, estimator: str) -> None:
     b = bench(model, brightness, grid, "f64")
-    found = b.estimate(motion_of(model), estimator=estimator, robust="all", noise=1.0)
+    found = b.estimate(motion_of(model), estimator=estimator, robust="all", noise=1.0, **MILD)
     assert_parameters_equal(b, found)
     assert_maps_equal(b, found)
 
@@ -153,7 +155,7 @@ def test_cells_of_blocks(make_bench: Callable, estimator: str, size: int, stride
     """Blocks that share samples or lie side by side, several to an output or one."""
     b = boundary_bench(make_bench, precision, size=size, stride=stride, at=30)
     assert b.sampling.x.blocks is not None
-    assert_parameters_equal(b, b.estimate(estimator=estimator, robust="all", noise=1.0, solver="jacobi"))
+    assert_parameters_equal(b, b.estimate(estimator=estimator, robust="all", noise=1.0, solver="jacobi", **MILD))
 
 
 @pytest.mark.parametrize("estimator", WEIGHTED)
@@ -204,7 +206,7 @@ def test_only_what_failed_is_estimated_anew(make_bench: Callable, estimator: str
     pixels = tuple((row, col) for row in (0, 2) for col in (0, 1, 13, 19, 26, 33, 39))
     for pixel in pixels:
         cells, _ = b.reference(*pixel, True)
-        assert changed[pixel] == twin.estimate(cells, found.problem).anew, pixel
+        assert changed[pixel] == bool(np.any(twin.estimate(cells, found.problem).weights != 1)), pixel
     assert_parameters_equal(b, found, pixels)
 
 

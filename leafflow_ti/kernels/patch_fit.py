@@ -12,7 +12,8 @@ from types import SimpleNamespace
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
-from leafflow_ti.kernels.patch import RANGE_CODE, Patch, patch_functions
+from leafflow_ti.kernels.maps import Output
+from leafflow_ti.kernels.patch import GROWTH, RANGE_CODE, Patch, patch_functions
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.texture import texture_functions
 from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value
@@ -20,6 +21,8 @@ from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value
 START, CLEAR, FINISH, COVARIANCE, DIFFERENCES = 1, 2, 4, 8, 16
 """What a step does besides adding its rows: forget the motion, forget the sums (both before), solve (after), find the
 covariance, and those of difference quotients (these in every step of a fit, or in none)."""
+HELD = 1e8
+"""Times as certain: an unknown that is held at 0."""
 
 
 @functools.cache
@@ -181,6 +184,11 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
         return total * (precise(1.0) / ti.cast(n_rows, precise))
 
     @ti.func
+    def chosen(p: ti.template(), number: ti.template(), ws: ti.template()):
+        """Where a robust estimate had to choose what of the reference's window belongs to the pixel."""
+        return ws[region(p, number, Region.OUT) + Output.SUPPORT * p.stride] < V(1.0)
+
+    @ti.func
     def leave_out(n_rows: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Rows of an own flow whose window has left the image or that follows nothing get zero values and design.
 
@@ -196,7 +204,7 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
         used = (shift < V(limit * limit)) & (mass > V(value[p.v + Value.MIN_MASS]))
         if number[p.n + Number.ROBUST] == 1:
             other = contradicts(n_rows, p, number, value, ws) > V(value[p.v + Value.MAX_CONTRADICTION])
-            used = used & (not (other & (ws[region(p, number, Region.ACTIVE)] > V(0.5))))
+            used = used & (not (other & chosen(p, number, ws)))
         for r in range(n_rows):
             for c in range(r + 1):
                 # Also where the covariance is no number: a unit matrix in its place.
@@ -307,6 +315,11 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
         for r in range(n):
             for c in range(r + 1):
                 ws[normal + tri(r, c) * p.stride] = ws[region(p, number, Region.NORMAL) + (r * n + c) * p.stride]
+        growth = number[p.n + Number.PLACE + GROWTH]
+        if number[p.n + Number.ROBUST] == 1 and growth >= 0:
+            # The flows of few cameras are left there: too few to tell growth from approach.
+            at = normal + tri(growth, growth) * p.stride
+            ws[at] = ti.select(chosen(p, number, ws), ws[at] * precise(HELD), ws[at])
         small.cholesky(ws, normal, n, -1, p.stride)
         small.solve(ws, normal, q, n, 1, p.stride)
         for j in range(MAX_UNKNOWNS):

@@ -87,7 +87,7 @@ MOST_NOISE, MOST_PX = 3.0, 0.02
 RELAXATION = 1.5
 """Factor of a step of over-relaxation; converges between 0 and 2."""
 
-MAX_CONTRADICTION = 8.0
+MAX_CONTRADICTION = 3.0
 """Mean squared difference, in error bars, between a camera's own flow and the reference's motion, above which a robust
 estimate is taken to be of another surface."""
 

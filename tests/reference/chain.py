@@ -153,7 +153,8 @@ class Solved:
 
     ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
     the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
-    ``anew``: the window was weighted anew; ``biased``: by the noise of all columns but the time-like ones, towards 0.
+    ``support``: mean weight where the window was weighted anew, at most 1; ``biased``: by the noise of all columns but
+    the time-like ones, towards 0.
     """
 
     J: np.ndarray
@@ -161,7 +162,7 @@ class Solved:
     variance: np.ndarray
     noise: np.ndarray
     rho: float
-    anew: bool = False
+    support: float = 1.0
     biased: bool = False
 
     @classmethod

@@ -39,23 +39,20 @@ class Found:
     N: Array
     weights: Array
     spread: float
+    share: float
 
     @classmethod
     def of(cls, cells, P, weights, S):
         """``S`` [cells]: the relative noise of the cells when they were weighed."""
         scaled = normalised(cells, weights) * weights * cells.w
-        return cls(P, *weighted(cells, weights), weights, float(scaled**2 @ S / np.sum(cells.w**2)))
-
-    @property
-    def anew(self):
-        """Whether cells have weights of their own."""
-        return bool(np.any(self.weights != 1))
+        spread = float(scaled**2 @ S / np.sum(cells.w**2))
+        return cls(P, *weighted(cells, weights), weights, spread, float(np.average(weights, weights=cells.w)))
 
     def solved(self, rho, biased):
         """What covariances follow from; ``rho`` is the smoothness of the texture, ``biased`` see ``chain.Solved``."""
         p = full(self.P)
         variance = np.einsum("ik,ij,jk->k", p, self.M, p) / np.einsum("ik,ij,jk->k", p, self.N, p)
-        return chain.Solved(self.M, self.P, variance, self.N, rho * self.spread, self.anew, biased)
+        return chain.Solved(self.M, self.P, variance, self.N, rho * self.spread, min(self.share, 1.0), biased)
 
 
 def full(P):
@@ -114,7 +111,7 @@ def plain(cells: Cells, estimator, scale=1.0):
     else:
         raw = chain.coordinate_scales(columns, scale)
         P = chain.solutions_tls(J, columns, cells.noise**-0.5 if estimator == "tls-equilibrated" else raw)
-    return Found(P, J, np.diag(cells.noise), np.ones_like(cells.w), 1.0)
+    return Found(P, J, np.diag(cells.noise), np.ones_like(cells.w), 1.0, 1.0)
 
 
 def reweighted(cells: Cells, iterations, solve):

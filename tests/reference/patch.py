@@ -3,6 +3,7 @@
 import numpy as np
 from reference.chain import solution_noise
 
+from leafflow_ti.kernels.patch_fit import HELD
 from leafflow_ti.models import AXES, ColumnSet
 from leafflow_ti.sampling import difference_variance
 from leafflow_ti.stages.estimate_tables import DENOISE, MAX_CONTRADICTION, MODEL_ERROR, TURNING_ERROR
@@ -247,6 +248,8 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
         for _, _, C, D, _, left_out, _ in sets:
             weights.append(np.linalg.inv(C + D @ cov_g @ D.T + left_out) if problem.weighted else np.eye(len(C)))
         normal = sum(A[:, which].T @ W @ A[:, which] for (A, *_), W in zip(sets, weights, strict=True))
+        if chosen and 9 in which:
+            normal[-1, -1] *= HELD  # growth
         gains = [np.linalg.solve(normal, A[:, which].T @ W) for (A, *_), W in zip(sets, weights, strict=True)]
         solution = sum(G @ s[1] for G, s in zip(gains, sets, strict=True))
         spreads = [spread_of(gains, sets, common)]
@@ -269,6 +272,9 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
             spread += part + part.T
         return spread
 
+    flows = problem.own_flows
+    # A robust estimate had to choose what of the reference's window belongs to the pixel.
+    chosen = flows and flows.reference_rows and ESTIMATORS[problem.estimator].robust and solved.support < 1
     q = np.zeros(10)
     for _ in range(problem.passes):
         first, rows = reference_rows(q)
@@ -279,8 +285,8 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
     sets, common = ([first], []) if problem.own_flows.reference_rows else ([], [])
     for step, one in zip(problem.own_flows.steps, own, strict=True):
         found, shared = own_rows(step, one, q)
-        if ESTIMATORS[problem.estimator].robust and problem.own_flows.reference_rows and one.anew:
-            # A robust estimate may have chosen another surface in this camera.
+        if chosen:
+            # In this camera it may have chosen another surface.
             A, value, C, D, _, left_out, _ = found
             own_errors = np.diag(C + D @ cov_g @ D.T + left_out)
             if np.mean((value - A @ q) ** 2 / own_errors) > MAX_CONTRADICTION:
