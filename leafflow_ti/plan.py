@@ -170,7 +170,7 @@ class Plan:
         lines = [
             f"model       {self.model}: {MODELS[self.model].summary}, {problem.columns.n} columns, "
             f"{len(self.layout.entries)} distinct moments, {problem.columns.n_time_like} solutions",
-            f"estimator   {problem.estimator}, solver {problem.solver}, "
+            f"estimator   {problem.estimator}{_weighing(problem)}, solver {problem.solver}, "
             f"{'weighted' if problem.weighted else 'plain'} least squares",
         ]
         if self.ranges:
@@ -209,6 +209,13 @@ class Plan:
             f"disk        at most {pixels * (4 * len(self.names) + 1) / 2**20:.0f} MiB",
         ]
         return "\n".join(lines)
+
+
+def _weighing(problem: Problem) -> str:
+    """In words how a robust estimator weighs, and where."""
+    if not ESTIMATORS[problem.estimator].robust:
+        return ""
+    return f" ({problem.penalty}, {'all pixels' if problem.robust == 'all' else 'where the plain fit failed'})"
 
 
 def make_plan(capture: Capture, config: RunConfig) -> Plan:
