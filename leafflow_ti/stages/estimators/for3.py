@@ -9,8 +9,8 @@ from __future__ import annotations
 from leafflow_ti.stages.estimators.moves import Estimator, Move, Stage, Weights, finished, null_space, rounds
 
 ROUNDS = 3
-"""Weights follow the solution: measured with noise of 10 at a contrast of 25 and strong divergence, the third changes it
-by less than a thousandth of its standard error."""
+"""Weights follow the solution: measured with noise of 10 at a contrast of 25 and strong divergence, the third changes
+it by less than a thousandth of its standard error."""
 
 
 def _moves(solver: str) -> list[Move]:
