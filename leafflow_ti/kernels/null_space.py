@@ -23,7 +23,8 @@ ROUNDS = 6
 @functools.cache
 def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``load``, ``scale``, ``least_squares``, ``factorise``, ``accept``, ``inverse_iteration``, ``jacobi``,
-    ``parameters``, ``residuals``, ``centre``, and of other estimators ``whiten``, ``unwhiten`` and ``fundamental``."""
+    ``parameters``, ``residuals`` and ``centre``; and what stages of weighted windows share with them: ``keep``,
+    ``left_out``, ``unsolved``."""
     precise, lanes, V = spec.precise, spec.lanes, spec.element
     small, identify = dense(spec), identify_functions(spec)
 
@@ -342,66 +343,18 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
         for j in range(number[p.n + Number.SOLUTIONS]):
             identify.at_centre(found + j * number[p.n + Number.FLOW] * p.stride, p, number, value, ws)
 
-    @ti.func
-    def whiten(
-        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
-        out: ti.template(),
-    ):  # fmt: skip
-        """``A := L^-1 A L^-T``, ``L L^T = S N S``: ``A v = λ N v`` as an eigenproblem; ``which`` as in ``scale``."""
-        n = number[p.n + Number.N]
-        packed, factor = region(p, number, Region.TENSOR), region(p, number, Region.NOISE_FACTOR)
-        noise, full = region(p, number, Region.WEIGHT_NOISE), region(p, number, Region.FULL)
-        for r in range(n):
-            for c in range(r + 1):
-                scale = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
-                element = ws[noise + tri(r, c) * p.stride] * scale
-                if left_out(r, c, p, number) == 1:
-                    element = V(ti.cast(r == c, precise))
-                ws[factor + tri(r, c) * p.stride] = element
-        small.cholesky(ws, factor, n, -1, p.stride)
-        small.unpack(ws, packed, full, n, p.stride)
-        for _ in range(2):
-            small.substitute(ws, factor, full, n, n, 0, 1, p.stride)
-            small.transpose(ws, full, n, p.stride)
-        for r in range(n):
-            for c in range(r + 1):
-                ws[packed + tri(r, c) * p.stride] = ws[full + (r * n + c) * p.stride]
-
-    @ti.func
-    def unwhiten(
-        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
-        out: ti.template(),
-    ):  # fmt: skip
-        """Eigenvectors of the whitened matrix become those of the pair of matrices."""
-        solution, factor = region(p, number, Region.SOLUTION), region(p, number, Region.NOISE_FACTOR)
-        small.substitute(ws, factor, solution, number[p.n + Number.N], number[p.n + Number.SOLUTIONS], 1, 2, p.stride)
-
-    @ti.func
-    def fundamental(
-        p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
-        out: ti.template(),
-    ):  # fmt: skip
-        """The eigenvectors of ``S (M - N) S`` whose eigenvalues are nearest to 0, by full Jacobi."""
-        n, k = number[p.n + Number.N], number[p.n + Number.SOLUTIONS]
-        moments, noise = region(p, number, Region.MOMENTS), region(p, number, Region.WEIGHT_NOISE)
-        full = region(p, number, Region.FULL)
-        for r in range(n):
-            for c in range(n):
-                one, two = ti.max(r, c), ti.min(r, c)
-                element = ws[moments + number[p.n + Number.LOWER + tri(one, two)] * p.stride]
-                element = element - ws[noise + tri(one, two) * p.stride]
-                scale = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
-                ws[full + (r * n + c) * p.stride] = element * scale
-        small.jacobi(ws, full, n, JACOBI_SWEEPS, p.stride)
-        for r in range(n):
-            at = full + (r * n + r) * p.stride
-            ws[at] = small.magnitude(ws[at])
-        small.sort_eigen(ws, full, n, k, p.stride)
-        unsolved(p, number, ws)
-        keep(full + n * n * p.stride, n, V(0.0) < V(1.0), p, number, ws)
-
-    stages = (
-        load, scale, factorise, least_squares, accept, inverse_iteration, jacobi, parameters, residuals, centre,
-        whiten, unwhiten, fundamental,
-    )  # fmt: skip
-    return SimpleNamespace(**{f.__name__: f for f in stages})
+    return SimpleNamespace(
+        load=load,
+        scale=scale,
+        factorise=factorise,
+        least_squares=least_squares,
+        accept=accept,
+        inverse_iteration=inverse_iteration,
+        jacobi=jacobi,
+        parameters=parameters,
+        residuals=residuals,
+        centre=centre,
+        keep=keep,
+        left_out=left_out,
+        unsolved=unsolved,
+    )

@@ -12,12 +12,14 @@ from leafflow_ti.kernels.patch_fit import patch_fit_stages
 from leafflow_ti.kernels.range_motion import range_motion_stages
 from leafflow_ti.kernels.reweight import reweight_stages
 from leafflow_ti.kernels.spec import KernelSpec
+from leafflow_ti.kernels.weighted import weighted_stages
 
 
 @functools.cache
 def _functions(spec: KernelSpec) -> dict[Stage, Any]:
     makers = (
         null_space_stages, covariance_stages, range_motion_stages, patch_fit_stages, maps_stages, reweight_stages,
+        weighted_stages,
     )  # fmt: skip
     made = {name: stage for make in makers for name, stage in vars(make(spec)).items()}
     return {stage: made[stage.name.lower()] for stage in Stage}
