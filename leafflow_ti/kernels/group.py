@@ -37,12 +37,12 @@ def region(p: ti.template(), number: ti.template(), name: ti.template()) -> ti.i
 
 
 @functools.cache
-def group_kernel(spec: KernelSpec, stages: tuple, long: bool = False):
+def group_kernel(spec: KernelSpec, stages: tuple):
     """A kernel: the stages ``(p, number, value, ws, J, out)`` that the steps name, for every group of a batch.
 
     ``row_groups`` groups cover a row of the output, ``pitch`` pixels are stored of it. A step's stage counts in
     ``stages``; with a single stage it does not matter. Group g of a task works at ``task task_step + g group_step`` of
-    the workspace. ``long``: see ``LaneKernel``.
+    the workspace.
     """
     real, precise, lanes, element = spec.real, spec.precise, spec.lanes, spec.element
     any_lane = dense(spec).any_lane
@@ -75,7 +75,7 @@ def group_kernel(spec: KernelSpec, stages: tuple, long: bool = False):
         row = group // row_groups
         return row * pitch + (group - row * row_groups) * lanes
 
-    @lane_kernel(lanes, long=long)
+    @lane_kernel(lanes, long=True)
     def groups(
         first_group: ti.i32,
         n_groups: ti.i32,

@@ -31,4 +31,4 @@ def stage_kernel(spec: KernelSpec, stage: Stage | None = None, reweighted: bool 
     if stage is not None:
         return group_kernel(spec, (functions[stage],))
     last = max(Stage) if reweighted else Stage.EMIT
-    return group_kernel(spec, tuple(functions[s] for s in Stage if s <= last), long=reweighted)
+    return group_kernel(spec, tuple(functions[s] for s in Stage if s <= last))
