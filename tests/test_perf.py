@@ -149,8 +149,7 @@ def test_packages_compute_the_same_tensors(peer: packages._Peer) -> None:
 def test_stages_are_put_beside_the_ceilings() -> None:
     found = by_name(stages.measure(stages.Settings(SMALL, strides=(2,), brightness=("none",), repeats=1)))
     for letter in "ABC":
-        # A difference of two times: on a busy machine even of either sign.
-        assert found[f"{letter}, share of the multiply-add peak, 12 columns, stride 2"].value != 0
+        assert found[f"{letter}, share of the multiply-add peak, 12 columns, stride 2"].value > 0
     for stage in ("splines", "refine"):
         assert 0 < found[f"{stage}, share of the multiply-add peak"].value < 1
     assert 1 <= found["refinement: steps of a pixel"].value <= 2 * 3

@@ -67,7 +67,7 @@ def test_yosemite_beats_the_printed_error(tmp_path: Path) -> None:
     field = yosemite.estimate_flow(tmp_path, **yosemite.PLAIN, stride=4)
     figures = yosemite.figures_of("here", field, yosemite.Truth.read())
     error, median, density = figures
-    assert density.value > 95.0
+    assert density.value > 99.0
     # 3.1 degrees are printed; every fourth pixel along x and y moves the mean by a tenth of a degree.
     assert error.met
     assert median.met
@@ -77,8 +77,8 @@ def test_yosemite_beats_the_printed_error(tmp_path: Path) -> None:
 def test_seedling_flow_is_that_of_its_root_tip_and_hook(tmp_path: Path) -> None:
     settings = hypocotyl.Settings()
     found = hypocotyl.estimate_growth(tmp_path, settings)
-    # The straight stem hides the motion along it.
-    assert np.isfinite(found.flow[found.plant]).mean() > 0.65
+    # Where the straight stem hides the motion along it there is no value.
+    assert np.isfinite(found.flow[found.plant]).mean() > 0.95
     ends = hypocotyl.ends(found, settings)
     for flow, speed in ends.values():
         # The ends are seen to a binned pixel, over 15 frames; their speed is not constant.

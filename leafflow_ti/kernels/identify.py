@@ -56,7 +56,7 @@ def identify_functions(spec: KernelSpec) -> SimpleNamespace:
         """
         xx, _, yy = texture.gradient(p, number, ws)
         gain, flow = value[p.v + Value.GAIN], number[p.n + Number.FLOW]
-        noise = texture.noise_variance(quietest(p, number, ws), p, value)
+        noise = texture.gradient_noise(quietest(p, number, ws), p, value)
         noise = ti.max(noise, (xx + yy) * (0.5 * value[p.v + Value.LEAST_SHARE] / gain))
         scale = noise * value[p.v + Value.UNKNOWN]
         largest = V(0.0)

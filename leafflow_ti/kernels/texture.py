@@ -16,7 +16,7 @@ but then the residual tells; a model with many columns fits a small window's noi
 
 @functools.cache
 def texture_functions(spec: KernelSpec) -> SimpleNamespace:
-    """``smoothness``, ``gradient`` and ``noise_variance``."""
+    """``smoothness``, ``gradient``, ``noise_variance`` and ``gradient_noise``."""
     V = spec.element
 
     @ti.func
@@ -52,4 +52,16 @@ def texture_functions(spec: KernelSpec) -> SimpleNamespace:
         """Image noise variance that texture must exceed: that of the residual, or the known one if it is larger."""
         return ti.max(residual, ti.min(V(value[p.v + Value.NOISE_LEVEL]), residual * TRUSTED))
 
-    return SimpleNamespace(smoothness=smoothness, gradient=gradient, noise_variance=noise_variance)
+    @ti.func
+    def gradient_noise(residual: ti.template(), p: ti.template(), value: ti.template()):
+        """Image noise variance that the gradients hold: as above, but of the residual only what noise explains.
+
+        What the model leaves out makes residuals larger; it takes nothing away from the texture.
+        """
+        known = V(value[p.v + Value.NOISE_LEVEL])
+        explained = ti.select(known > V(0.0), ti.min(residual, known * TRUSTED), residual)
+        return ti.max(explained, ti.min(known, residual * TRUSTED))
+
+    return SimpleNamespace(
+        smoothness=smoothness, gradient=gradient, noise_variance=noise_variance, gradient_noise=gradient_noise
+    )
