@@ -40,7 +40,7 @@ def draw_curves(path: Path, panels: Sequence[Curves], columns: int = 2) -> Path:
         raise MissingExtra("matplotlib", "plot", "drawing diagrams") from None
     labels = list(dict.fromkeys(label for panel in panels for label in panel.y))
     rows = -(-len(panels) // columns)
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context({**STYLE, "svg.fonttype": "none"}):
         figure = Figure(figsize=(5.2 * columns, 3.4 * rows + 0.5), layout="constrained")
         handles: dict[str, Any] = {}
         grid = np.ravel(figure.subplots(rows, columns))
@@ -52,7 +52,7 @@ def draw_curves(path: Path, panels: Sequence[Curves], columns: int = 2) -> Path:
             list(handles.values()), list(handles), loc="outside lower center", ncols=2 * columns, frameon=False
         )
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
+        figure.savefig(path, dpi=110, metadata={"Date": None, "Creator": None} if path.suffix == ".svg" else None)
     return path
 
 

@@ -7,19 +7,15 @@ frame from images in memory to maps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from leafflow_ti.api import estimate
-from leafflow_ti.errors import MissingExtra
 from leafflow_ti.runtime import Device, start
 from perf.bench import Scene, median_seconds, time_stages
 from perf.cases import Options
-from perf.dissertation.plots import COLOURS, MARKERS, STYLE
+from perf.curves import Curves, draw_curves
 from perf.figures import Figure, Outcome
 
 LINEAR = 1.25
@@ -134,34 +130,11 @@ def _cameras(settings: Settings, base: Scene) -> Panel:
     return panel
 
 
-def _draw(panels: Sequence[Panel], path: Path) -> Path:
-    """One picture, a panel for each abscissa. Raises MissingExtra without matplotlib."""
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure as Picture
-    except ImportError:
-        raise MissingExtra("matplotlib", "plot", "drawing diagrams") from None
-    with matplotlib.rc_context({**STYLE, "svg.fonttype": "none"}):
-        picture = Picture(figsize=(10.5, 6.2), layout="constrained")
-        grid = np.ravel(picture.subplots(2, 3))
-        handles: dict[str, Any] = {}
-        for axes, panel in zip(grid, panels, strict=True):
-            for stage, us in panel.us.items():
-                k = list(STAGES).index(stage)
-                (line,) = axes.plot(
-                    panel.x, us, color=COLOURS[k], marker=MARKERS[k], markerfacecolor="none", linewidth=1.3
-                )
-                handles.setdefault(STAGES[stage], line)
-            axes.set_ylim(0, 1.08 * max(map(max, panel.us.values())))
-            axes.set_xlabel(panel.abscissa)
-            axes.set_ylabel(f"us per {panel.work}")
-            axes.set_title(panel.title)
-            axes.grid(color="#dddddd", linewidth=0.6)
-            axes.set_axisbelow(True)
-        picture.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=5, frameon=False)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        picture.savefig(path, metadata={"Date": None, "Creator": None})
-    return path
+def _curves(panel: Panel) -> Curves:
+    """The diagram of a panel, from 0 on: proportions count."""
+    top = 1.08 * max(map(max, panel.us.values()))
+    values = {STAGES[stage]: us for stage, us in panel.us.items()}
+    return Curves(panel.title, panel.abscissa, f"us per {panel.work}", panel.x, values, limits=(0.0, top))
 
 
 def measure(settings: Settings, folder: Path) -> Outcome:
@@ -179,7 +152,7 @@ def measure(settings: Settings, folder: Path) -> Outcome:
         Figure("a pixel of the largest image over one of the smallest", size[-1] / size[0], "x", LINEAR),
         Figure("a frame at the largest sigma over the smallest", sigma[-1] / sigma[0], "x", SIGMA_FREE),
     ]
-    picture = _draw(panels, folder / "scaling.svg")
+    picture = draw_curves(folder / "scaling.svg", [_curves(panel) for panel in panels], columns=3)
     return Outcome(tuple(figures), asdict(settings), (f"device: {device}",), (picture,))
 
 
