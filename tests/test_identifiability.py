@@ -125,3 +125,23 @@ def test_identified_groups_are_stored_as_flags(tmp_path: Path) -> None:
     assert np.isinf(found["flow_y_std"]).any()
     flags = zarr.open_group(out)["identified"].attrs
     assert dict(zip(flags["flag_meanings"].split(), flags["flag_masks"], strict=True)) == IDENTIFIED
+
+
+@pytest.mark.parametrize(("contrast", "divergence"), [(4.0, 0.05), (8.0, 0.05), (8.0, 0.1)])
+def test_misfit_is_no_noise_and_mixes_nothing_in(contrast: float, divergence: float) -> None:
+    """Strong stripes that diverge, which the model leaves out, over weak ones at right angles, which hold less than
+    that residual but far more than the noise: these determine the flow across them, and it must not be mixed with
+    what the strong ones leave."""
+    y, x = np.mgrid[:44, :52] - np.array([22.0, 26.0])[:, None, None]
+    wave = 2 * np.pi / 9
+    clean = [
+        100 + 40 * np.cos(wave * x * np.exp(-divergence * t)) + contrast * np.cos(wave * (y - 0.2 * t))
+        for t in range(-3, 4)
+    ]
+    images = np.array(clean) + np.random.default_rng(0).normal(0, 0.3, (7, 44, 52))
+    field = lf.estimate(capture_from_array(images[:, None, None]), frame=3, model="flow", window=17, noise=0.3)
+    inside = field.status != Status.BORDER
+    error, std = field["flow_y"][inside] - 0.2, field["flow_y_std"][inside]
+    assert np.isfinite(error).mean() > 0.95
+    assert np.mean(np.abs(error) <= 4 * std) >= 0.98
+    assert np.sqrt(np.mean(error[np.isfinite(error)] ** 2)) < 0.05

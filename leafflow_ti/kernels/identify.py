@@ -46,18 +46,17 @@ def identify_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def ignorance(
-        response: ti.i32, rows_at: ti.i32, n_rows: ti.i32, p: ti.template(), number: ti.template(),
-        value: ti.template(), ws: ti.template(),
+        response: ti.i32, rows_at: ti.i32, n_rows: ti.i32, level: ti.template(), p: ti.template(),
+        number: ti.template(), value: ti.template(), ws: ti.template(),
     ):  # fmt: skip
-        """Factor β of ``β E^T J_ff^-2 E``, what the rows may be off where a row is not determined; 0 where all are.
+        """For image noise of variance ``level``: factor β of ``β E^T J_ff^-2 E``, what the rows may be off where a row is not determined; 0 where all are.
 
         In scaled columns a displacement of 1 px by any parameter is as long as ``GAIN^1/2``. With UNKNOWN σ² over the
         information along a direction, squared, it counts there as 1 px of unknown size and next to nothing elsewhere.
         """
         xx, _, yy = texture.gradient(p, number, ws)
         gain, flow = value[p.v + Value.GAIN], number[p.n + Number.FLOW]
-        noise = texture.gradient_noise(quietest(p, number, ws), p, value)
-        noise = ti.max(noise, (xx + yy) * (0.5 * value[p.v + Value.LEAST_SHARE] / gain))
+        noise = ti.max(level, (xx + yy) * (0.5 * value[p.v + Value.LEAST_SHARE] / gain))
         scale = noise * value[p.v + Value.UNKNOWN]
         largest = V(0.0)
         for c in range(n_rows):
@@ -82,7 +81,7 @@ def identify_functions(spec: KernelSpec) -> SimpleNamespace:
                 ws[factor + tri(r, c) * p.stride] = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride] * s
         small.cholesky(ws, factor, flow, -1, p.stride)
         small.clear(ws, x, flow, p.stride)
-        noise = quietest(p, number, ws) * value[p.v + Value.DENOISE]
+        noise = texture.gradient_noise(quietest(p, number, ws), p, value) * value[p.v + Value.DENOISE]
         for _ in range(REPEATS):
             for r in range(flow):
                 s = value[p.v + Value.SCALE + r]
@@ -111,8 +110,12 @@ def identify_functions(spec: KernelSpec) -> SimpleNamespace:
     ):  # fmt: skip
         """Where a row of solution ``which`` is not determined: add what is not known to the packed covariance at
         ``cov``, and take the regularised solution. ``response``: ``J_ff^-1 E`` [F, n_rows]."""
-        factor = ignorance(response, rows_at, n_rows, p, number, value, ws)
-        lost = factor > V(0.0)
+        residual = quietest(p, number, ws)
+        held = texture.gradient_noise(residual, p, value)
+        factor = ignorance(response, rows_at, n_rows, held, p, number, value, ws)
+        # Total least squares mixes a direction that holds less than the residual, whatever that is made of.
+        mixed = texture.noise_variance(residual, p, value)
+        lost = ignorance(response, rows_at, n_rows, mixed, p, number, value, ws) > V(0.0)
         if small.any_lane(lost) == 1:
             flow = number[p.n + Number.FLOW]
             for r in range(n_rows):

@@ -16,7 +16,7 @@ from leafflow_ti.kernels.numbers import AGAIN, NARROW, Penalty, Weights
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.workspace import Number, Region, Value
 
-LEAST_SHARE = 1e-3
+LEAST_WEIGHT = 1e-3
 """Least mean weight of a window: where next to nothing counts, the solution stays as it is."""
 
 
@@ -293,7 +293,7 @@ def reweight_stages(spec: KernelSpec) -> SimpleNamespace:
         n = number[p.n + Number.N]
         sums, moments = region(p, number, Region.WEIGHT_SUMS), region(p, number, Region.MOMENTS)
         noise, active = region(p, number, Region.WEIGHT_NOISE), ws[region(p, number, Region.ACTIVE)] > V(0.5)
-        enough = active & (weighted > mass * LEAST_SHARE)
+        enough = active & (weighted > mass * LEAST_WEIGHT)
         grown = mass / ti.select(enough, weighted, V(1.0))
         for e in range(t.entries):
             at = moments + e * p.stride
