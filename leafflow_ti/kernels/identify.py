@@ -3,6 +3,9 @@
 A direction of the flow parameters along which J_ff holds hardly more than noise is not determined: stripes hide the
 flow along them. Total least squares then takes any mixture of the solution and that direction, whose size spoils the
 parameters that are determined, too; and noise propagated through J_ff^-1 knows nothing of what the data do not hold.
+
+Noise is that of the images: what a model leaves out makes residuals larger and takes no texture away. Total least
+squares mixes directions that hold less than the residual all the same: there the solution is a regularised one, too.
 """
 
 import functools
@@ -49,7 +52,9 @@ def identify_functions(spec: KernelSpec) -> SimpleNamespace:
         response: ti.i32, rows_at: ti.i32, n_rows: ti.i32, level: ti.template(), p: ti.template(),
         number: ti.template(), value: ti.template(), ws: ti.template(),
     ):  # fmt: skip
-        """For image noise of variance ``level``: factor β of ``β E^T J_ff^-2 E``, what the rows may be off where a row is not determined; 0 where all are.
+        """Factor β of ``β E^T J_ff^-2 E``, what the rows may be off where a row is not determined; 0 where all are.
+
+        ``level``: variance of the image noise that texture must exceed.
 
         In scaled columns a displacement of 1 px by any parameter is as long as ``GAIN^1/2``. With UNKNOWN σ² over the
         information along a direction, squared, it counts there as 1 px of unknown size and next to nothing elsewhere.
