@@ -176,6 +176,19 @@ class Solved:
         n = len(self.P)
         return self.J[:n, :n] - denoise * np.min(self.variance) * self.noise[:n, :n]
 
+    def regularised(self, known, denoise):
+        """P [n_flow, 1] that takes the place of a single solution which holds a direction of no more than noise.
+
+        ``known``: variance of the images' noise. Three steps with J_ff, noise and all, to the solution without noise.
+        """
+        n, S = len(self.P), np.diag(self.noise) ** -0.5
+        residual = float(np.min(self.variance))
+        J, held = self.J * np.outer(S, S), max(min(residual, 4 * known), min(known, 4 * residual)) * denoise
+        x = np.zeros(n)
+        for _ in range(3):
+            x = x + np.linalg.solve(J[:n, :n], held * x - J[:n, :n] @ x - J[:n, n])
+        return (S[:n] * x / S[n])[:, None]
+
     def covariances(self, columns: ColumnSet, sampling: Sampling, denoise):
         """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions."""
         n, k = columns.n_flow, columns.n_time_like
