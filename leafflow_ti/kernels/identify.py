@@ -41,8 +41,8 @@ def identify_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def at_centre(parameters: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
-        """Parameters at the window's centre, as at a place that stands still: constants where centred squares are not 0,
-        derivatives along time without what the shift of the images made of those along x and y."""
+        """Parameters at the window's centre, as at a place that stands still: constants where centred squares are not
+        0, derivatives along time without what the shift of the images made of those along x and y."""
         for term in range(number[p.n + Number.CENTRE_TERMS]):
             at = parameters + number[p.n + Number.CENTRE + 2 * term] * p.stride
             other = parameters + number[p.n + Number.CENTRE + 2 * term + 1] * p.stride

@@ -314,6 +314,6 @@ class Value(IntEnum):
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9
     CENTRE = CROSS + 18  # MAX_CENTRE_TERMS: factors
-    PARTNER = CENTRE + MAX_CENTRE_TERMS  # MAX_COLUMNS: factor of the noise shared with each column of the reference model
+    PARTNER = CENTRE + MAX_CENTRE_TERMS  # MAX_COLUMNS: factors of the noise shared with the reference model
     DIFFERENCE = PARTNER + MAX_COLUMNS  # 2 x 7: by axis and offset code of a row; roots of sampling.difference_variance
     RATIO = DIFFERENCE + 14  # k x packed [F], then k x NOISE_TERMS

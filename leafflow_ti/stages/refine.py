@@ -76,13 +76,7 @@ class RefineStage:
         self._mask: Any = None
         self._gaps: list[Gaps | None] = [None] * n
         lanes = device.dense.lanes
-        tables = RefineTables.of(plan, view, lanes, self.pitch, device.gpu)
-        self.size = tables.size
-        self._tables = (
-            device.array(tables.size, "int"), device.array(tables.value, "algebra"),
-            device.vectors(device.array(tables.image, "algebra"), lanes),
-        )  # fmt: skip
-        self._samples = device.vectors(device.array(tables.sample), lanes)
+        self.set_view(view)
         storage, algebra = (np.dtype(device.real(kind)).itemsize for kind in ("storage", "algebra"))
         space = Workspaces.of(plan, lanes, (storage, algebra), device.gpu, device.threads)
         self._batch = self._slots_n = space.slots
@@ -91,6 +85,17 @@ class RefineStage:
             self._batch = max(space.slots, int(LAUNCH_SECONDS * device.threads * SAMPLES_PER_SECOND / samples))
         self._real = device.zeros(space.slots * space.real * lanes)
         self._precise = device.zeros(space.slots * space.precise * lanes, "algebra")
+
+    def set_view(self, view: View) -> None:
+        """Take images that are shifted in another way, or another camera."""
+        device, lanes = self.device, self.device.dense.lanes
+        tables = RefineTables.of(self.plan, view, lanes, self.pitch, device.gpu)
+        self.size = tables.size
+        self._tables = (
+            device.array(tables.size, "int"), device.array(tables.value, "algebra"),
+            device.vectors(device.array(tables.image, "algebra"), lanes),
+        )  # fmt: skip
+        self._samples = device.vectors(device.array(tables.sample), lanes)
 
     def reset(self) -> None:
         """Forget all frames."""
