@@ -21,7 +21,7 @@ from leafflow_ti.growth import growth_maps
 from leafflow_ti.identify import settle
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
-from leafflow_ti.reading import Reader
+from leafflow_ti.reading import Mask, Reader
 from leafflow_ti.refine_plan import Effort
 from leafflow_ti.refinement import Place, refine_maps, refine_middle
 from leafflow_ti.runtime import Device
@@ -42,8 +42,8 @@ class Pipeline:
         self._apart = apart
         self.plan, self.capture, self.device = plan, capture, device
         self.trace = trace or Trace()
-        self._reader = Reader(plan, capture, device.real("storage"))
-        self._stays = Stays(plan, self._reader)
+        self.reader = Reader(plan, capture, device.real("storage"))
+        self.stays = Stays(plan, self.reader)
         self._engines: dict[Band, Engine] = {}
         # Output pixels of the plan and those around them; rows and columns below count along these.
         self._y, self._x = (_widened(r, n, plan.margin) for r, n in ((plan.y, capture.height), (plan.x, capture.width)))
@@ -104,6 +104,9 @@ class Pipeline:
 
     def run(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
         """Compute every unit that is not ``done`` and hand over its maps [rows, columns] and status."""
+        if self.plan.adaptive:
+            self._run_adaptive(done, deliver)
+            return
         for band in range(self.plan.bands):
             pending = [t for t in range(len(self.plan.frames)) if self.plan.unit(t, band).index not in done]
             for first, last in _runs(pending):
@@ -111,9 +114,26 @@ class Pipeline:
                     for unit, maps, status in units:
                         deliver(unit, maps, status)
 
+    def _run_adaptive(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
+        """Frame by frame: the bands of a frame share what its search has found."""
+        from leafflow_ti.adaptive import Adaptive
+
+        adaptive, bands = Adaptive(self), range(self.plan.bands)
+        for t_index in range(len(self.plan.frames)):
+            pending = [b for b in bands if self.plan.unit(t_index, b).index not in done]
+            if pending:
+                with active(self.trace):
+                    for unit, maps, status in adaptive.units(t_index, pending):
+                        deliver(unit, maps, status)
+
     def _make_engine(self, band: Band) -> Engine:
         first, aim = (self._x[0], self._y[0]), Aim(self.plan.preshift)
-        return Engine.of(self.device, self.plan, band, lambda n: self._stays.view(first, band, n, aim), self._apart)
+        return Engine.of(self.device, self.plan, band, lambda n: self.stays.view(first, band, n, aim), self._apart)
+
+    @property
+    def mask(self) -> Mask | None:
+        """Pixels [height, width] that may be measured; None: all."""
+        return self.reader.mask
 
     def keep(self) -> None:
         """Keep the stages of the last bands for the next estimate."""
@@ -130,6 +150,8 @@ class Pipeline:
         ``pair``: where the axis stands in pairs (x, y); cameras are (rows, columns).
         """
         plan = self.plan
+        if plan.adaptive:
+            return slice(0, len(positions))  # what is left of a window decides, pass by pass
         reach = plan.reach(axis) if plan.config.window.border == "full" else 0
         shifts = [plan.preshift[pair] * (k - self.capture.reference[1 - pair]) for k in plan.cameras[1 - pair]]
         first, last = reach - min(shifts), size - 1 - reach - max(shifts)
@@ -153,16 +175,16 @@ class Pipeline:
         latency = stay.engine.tensor.latency
         frames = range(plan.frames[first] - latency, plan.frames[last] + latency + 1)
         waiting: deque[Sample] = deque(maxlen=latency + 1)
-        with contextlib.closing(self._reader.blocks(frames, stay.box, aim)) as blocks:
+        with contextlib.closing(self.reader.blocks(frames, stay.box, aim)) as blocks:
             for t in frames:
                 with span("host", f"frame {t}"):
-                    sample, tensors = self._stays.push(stay, t, *next(blocks))
+                    sample, tensors = self.stays.push(stay, t, *next(blocks))
                     waiting.append(without_images(sample))
                     del sample
                     if tensors is None:
                         continue
                     self.device.synchronize()
-                    maps, codes = self.framed(index, *self._stays.maps(stay, tensors, waiting[0]))
+                    maps, codes = self.framed(index, *self.stays.maps(stay, tensors, waiting[0]))
                     if stay.engine.refine and plan.refine:
                         y, x = self.around(index)
                         place = Place(y, x, (stay.wide.y, stay.wide.x), plan.geometry)
@@ -175,7 +197,7 @@ class Pipeline:
         plan, (rows, cols) = self.plan, self.extent(index)
         band = Band.of(plan.problem.sampling, rows.stop - rows.start, cols.stop - cols.start, plan.x.step)
         at = self._x[cols.start], self._y[rows.start]
-        return self._stays.move(self.engine(band), band, at, Aim(plan.preshift))
+        return self.stays.move(self.engine(band), band, at, Aim(plan.preshift))
 
     def engine(self, band: Band) -> Engine:
         """The stages for a band of this size; those for the last one are kept."""
@@ -187,7 +209,7 @@ class Pipeline:
     def read_alone(self, index: int, frames: range) -> dict[str, float]:
         """Seconds of reading and of decoding a band's images of these frames while nothing else goes on."""
         trace, box, aim = Trace(), self._move(index).box, Aim(self.plan.preshift)
-        with active(trace), contextlib.closing(self._reader.blocks(frames, box, aim, ahead=0)) as blocks:
+        with active(trace), contextlib.closing(self.reader.blocks(frames, box, aim, ahead=0)) as blocks:
             for _ in blocks:
                 pass
         return trace.seconds
@@ -208,29 +230,34 @@ class Pipeline:
         return self._y[self._around(self.plan.band(index))], self._x
 
     def framed(
-        self, index: int, maps: Maps | None = None, status: NDArray[np.uint8] | None = None
+        self,
+        index: int,
+        maps: Maps | None = None,
+        status: NDArray[np.uint8] | None = None,
+        joined: tuple[Mask, Mask] | None = None,
     ) -> tuple[Maps, NDArray[np.uint8]]:
         """Maps and status of a band and what is computed around it, with what was measured at its place.
 
-        Border around that, masked where the mask says; growth from the velocity's differences.
+        Border around that, masked where the mask says; growth from the velocity's differences between pixels that are
+        ``joined`` (as of ``growth_maps``).
         """
         plan, (y, x) = self.plan, self.around(index)
         shape = (len(y), len(x))
         codes = np.full(shape, Status.BORDER, np.uint8)
-        framed: Maps = {name: empty_map(name, shape) for name in self._stays.names}
+        framed: Maps = {name: empty_map(name, shape) for name in self.stays.names}
         whole, (rows, cols) = self._around(plan.band(index)), self.extent(index)
         place = (slice(rows.start - whole.start, rows.stop - whole.start), cols)
         if status is not None:
             codes[place] = status
-        if self._reader.mask is not None:
-            codes[~self._reader.mask[np.ix_(y, x)]] = Status.MASKED
+        if self.reader.mask is not None:
+            codes[~self.reader.mask[np.ix_(y, x)]] = Status.MASKED
         empty = ~np.isin(codes[place], HAS_VALUE)
         for name, values in (maps or {}).items():
             values[empty] = empty_map(name, ())
             framed[name][place] = values
         if plan.differences:
             geometry, sampling = plan.geometry, plan.problem.sampling
-            growth = growth_maps(framed, y, x, geometry.f_px, geometry.principal_px, sampling)
+            growth = growth_maps(framed, y, x, geometry.f_px, geometry.principal_px, sampling, joined)
             framed.update({name: values.astype(np.float32) for name, values in growth.items()})
         return framed, codes
 

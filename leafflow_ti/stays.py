@@ -25,6 +25,8 @@ from leafflow_ti.status import Status
 from leafflow_ti.trace import span
 
 Maps = dict[str, NDArray[Any]]
+Layer = Callable[[Box], Mask]
+"""Of a block of the reference image, [rows, cols]: where the surface is that is measured."""
 Hidden = Callable[[int, Box], Mask | None]
 """Of a frame and a block: [sy, sx, rows, cols], where an image shows something else than what is measured; None:
 nowhere."""
@@ -76,12 +78,12 @@ class Stays:
         )  # fmt: skip
 
     def move(
-        self, engine: Engine, band: Band, at: tuple[int, int], aim: Aim, frame: int = 0, layer: Mask | None = None,
+        self, engine: Engine, band: Band, at: tuple[int, int], aim: Aim, frame: int = 0, layer: Layer | None = None,
         hidden: Hidden | None = None,
     ) -> Stay:  # fmt: skip
         """Bring an engine, all frames forgotten, to the output pixels of a band, the first of which is (x, y) ``at``.
 
-        ``layer`` [height, width]: where the surface is that is measured; None: everywhere.
+        ``layer``: where the surface is that is measured; None: everywhere. ``hidden``: see there.
         """
         engine.reset()
         engine.estimate.set_view(self.view(at, band, engine.tensor.out_pitch, aim))
@@ -96,7 +98,7 @@ class Stays:
             slice(engine.widening, engine.widening + block.rows),
             slice(engine.widening, engine.widening + block.cols),
         )
-        shown = None if layer is None else _cut(layer, wide)
+        shown = None if layer is None else layer(wide)
         if engine.refine:
             masked = self.reader.masked(wide)
             engine.refine.set_mask(masked if shown is None else shown if masked is None else shown & masked)
@@ -208,12 +210,3 @@ def _centres(band: Band) -> tuple[slice, slice]:
         slice(band.halo_y, band.halo_y + (band.rows - 1) * band.stride + 1, band.stride),
         slice(band.halo_x, band.halo_x + (band.cols - 1) * band.stride + 1, band.stride),
     )
-
-
-def _cut(values: Mask, box: Box) -> Mask:
-    """The part of a mask that a block shows; False beyond the image."""
-    out = np.zeros((box.rows, box.cols), np.bool_)
-    y0, x0 = max(box.y, 0), max(box.x, 0)
-    part = values[y0 : max(box.y + box.rows, 0), x0 : max(box.x + box.cols, 0)]
-    out[y0 - box.y : y0 - box.y + part.shape[0], x0 - box.x : x0 - box.x + part.shape[1]] = part
-    return out
