@@ -45,7 +45,7 @@ class Leaf:
     pointed: bool
 
     def inside(self, offsets: Array) -> NDArray[np.bool_]:
-        """Which material points of the plane, ``offsets`` [..., 3] from its centre at t = 0, belong to the leaf: [...]."""
+        """Which points of the plane belong to the leaf: ``offsets`` [..., 3] [mm] from its centre at t = 0."""
         pq = offsets @ plane_axes(self.surface.zx, self.surface.zy)
         p, q = pq[..., 0], pq[..., 1]
         along = (math.cos(self.turn) * p + math.sin(self.turn) * q) / self.half[0]
@@ -154,7 +154,7 @@ class LeavesScene(CameraGrid):
         (cx, cy), (px, py) = ((n - 1) / 2 for n in self.size), self.principal
         x, y = cx - px + away * math.cos(bearing), cy - py + away * math.sin(bearing)
         surface = self._plane(label, x, y, depth, zx, zy, motion)
-        length = extent * random.uniform(0.22, 0.28) * depth / self.f_px
+        length = extent * random.uniform(0.28, 0.34) * depth / self.f_px
         return Leaf(surface, (length, length * random.uniform(0.5, 0.7)), bearing, pointed=label % 2 == 1)
 
     def log_light(self, points: Array, t: float) -> Array:
