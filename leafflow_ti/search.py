@@ -39,8 +39,8 @@ SLOTS = 64
 """Motions at most among which a pixel chooses."""
 CANDIDATE_TILE, CORRELATED, PEAKS = 32, 64, 6
 """Correlations: distance and size [px] of their windows, peaks of each."""
-REFINING_TILES = (32, 16, 16)
-"""Tiles [px] in which later rounds gather candidates."""
+REFINING = ((32, 1.0), (16, 0.5), (16, 0.25))
+"""Of later rounds: tiles [px] in which candidates are gathered, and distance [px] of candidates."""
 OWN, OTHERS = 12, 4
 """Candidates that a tile takes from itself and from each tile around it."""
 
@@ -254,9 +254,9 @@ class _Flow(_Search):
         middle = self.prepared(self.frame, *self.reference, scale, costs)[-1]
         others = [self.prepared(*key, scale, costs)[-1] for key in keys]
         labels = tiled(proposals(middle, others, signs, reach), CANDIDATE_TILE, middle.shape, reach)
-        for tile in REFINING_TILES:
+        for tile, unit in REFINING:
             found = self.choose(scale, keys, views, labels, costs)
-            labels = tiled(votes(found.displacement, tile), tile, middle.shape, reach)
+            labels = tiled(votes(found.displacement / unit, tile), tile, middle.shape, reach, unit)
         found = self.choose(scale, keys, views, labels, costs)
         shape = (self.extent.height, self.extent.width)
         motion = np.stack([enlarged(m, scale, shape) for m in found.displacement]) * np.float32(scale)
@@ -309,9 +309,11 @@ def votes(displacement: Image, tile: int) -> list[NDArray[np.int64]]:
     return found
 
 
-def tiled(candidates: list[NDArray[np.int64]], tile: int, shape: tuple[int, ...], reach: int) -> Labels:
+def tiled(
+    candidates: list[NDArray[np.int64]], tile: int, shape: tuple[int, ...], reach: int, unit: float = 1.0
+) -> Labels:
     """Labels of each tile: its own candidates and those of the tiles around it, in turn, then the neighbours of all of
-    them; at most ``SLOTS`` and none longer than ``reach`` px along x or y."""
+    them; at most ``SLOTS`` and none longer than ``reach`` px along x or y. Candidates are in units of ``unit`` px."""
     tiles_y, tiles_x = -(-shape[0] // tile), -(-shape[1] // tile)
     count = np.zeros(tiles_y * tiles_x, np.int32)
     values = np.zeros((tiles_y * tiles_x, SLOTS, 2))
@@ -326,9 +328,9 @@ def tiled(candidates: list[NDArray[np.int64]], tile: int, shape: tuple[int, ...]
         ]
         near = np.concatenate([candidates[here][:OWN], *(c[:OTHERS] for c in around)])
         wide = (near[:, None] + steps).reshape(-1, 2)
-        every = np.concatenate([near, wide[np.abs(wide).max(axis=1) <= reach]])
+        every = np.concatenate([near, wide[np.abs(wide).max(axis=1) * unit <= reach]])
         _, first = np.unique(every, axis=0, return_index=True)
         chosen = every[np.sort(first)[:SLOTS]]
         count[here] = len(chosen)
-        values[here, : len(chosen)] = chosen
-    return Labels(tile, tiles_x, count, values, 1.0)
+        values[here, : len(chosen)] = unit * chosen
+    return Labels(tile, tiles_x, count, values, unit)
