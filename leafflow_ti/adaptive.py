@@ -21,16 +21,18 @@ from leafflow_ti.capture import Capture
 from leafflow_ti.field import empty_map
 from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan, Unit
-from leafflow_ti.reading import Box, Mask
-from leafflow_ti.refinement import Place, refine_maps
+from leafflow_ti.reading import Mask
+from leafflow_ti.refinement import Place, refine_beyond, refine_maps, ring
 from leafflow_ti.search import Extent, coarse_search
 from leafflow_ti.stages.tensor import Band
-from leafflow_ti.stays import Maps, Stay, without_images
 from leafflow_ti.status import HAS_VALUE, Status
+from leafflow_ti.stays import Maps, Stay, without_images
 from leafflow_ti.surfaces import EDGE, REACH, Surfaces, dilated
 from leafflow_ti.trace import span
 
 Codes = NDArray[np.uint8]
+BEYOND = (Status.BORDER, Status.INCOHERENT, Status.NOT_CONVERGED)
+"""Statuses of pixels that the refinement may still have values for: not all images see all of their windows."""
 UNDECIDED = -1
 """Instead of the number of a label: no pass gave a value."""
 
@@ -76,16 +78,17 @@ class Adaptive:
                 joined = _joined(surfaces.shown[np.ix_(range(4), y, x)])
                 maps, codes = pipeline.framed(index, maps, codes, joined)
                 if plan.refine:
-                    for tile in tiles:
-                        for label in tile.labels:
-                            self._refine(tile, surfaces, label, frame, maps, codes, chosen)
+                    self._refine(tiles, surfaces, frame, maps, codes, chosen)
                 codes[(codes == Status.OK) & edges[np.ix_(y, x)]] = Status.CONTESTED
                 result = pipeline.cut(index, maps, codes)
             yield plan.unit(t_index, index), *result
 
     def _surfaces(self, frame: int) -> Surfaces:
         """What a frame shows, by the coarse search."""
-        plan, capture, search = self.plan, self.capture, self.plan.config.search
+        plan, capture = self.plan, self.capture
+        search = plan.config.search
+        disparities = None if isinstance(search.disparity_range, str) else search.disparity_range
+        motions = None if isinstance(search.motion_range, str) else search.motion_range
         extent = extent_of(plan, self.capture)
 
         def image(t: int, sy: int, sx: int) -> NDArray[np.float32]:
@@ -93,8 +96,8 @@ class Adaptive:
 
         coarse = coarse_search(
             self.pipeline.device, image, extent, reference=capture.reference, frame=frame,
-            moving="t" in plan.problem.columns.solutions, disparity_range=search.disparity_range,
-            motion_range=search.motion_range, mask=self.pipeline.mask,
+            moving="t" in plan.problem.columns.solutions, disparity_range=disparities, motion_range=motions,
+            mask=self.pipeline.mask,
         )  # fmt: skip
         return Surfaces(self.pipeline.device, coarse, extent, plan.cameras, capture.reference)
 
@@ -158,20 +161,51 @@ class Adaptive:
         return maps, codes, chosen
 
     def _refine(
-        self, tile: _Tile, surfaces: Surfaces, label: int, frame: int, maps: Maps, codes: Codes,
-        chosen: NDArray[np.int64],
+        self, tiles: list[_Tile], surfaces: Surfaces, frame: int, maps: Maps, codes: Codes, chosen: NDArray[np.int64]
+    ) -> None:
+        """Refine a band's pixels, then those that no pass had values for, from tile to tile as far as they lead."""
+        for tile in tiles:
+            for label in tile.labels:
+                mine = chosen[tile.place] == label
+                if (mine & (codes[tile.place] == Status.OK)).any():
+                    self._refine_label(tile, surfaces, label, frame, maps, codes, mine, False)
+        missing = np.zeros(codes.shape, np.bool_)
+        for tile in tiles:
+            missing[tile.place] = surfaces.known[np.ix_(tile.y, tile.x)]
+        missing &= np.isin(codes, BEYOND)
+        before = -1
+        while before != (before := int(np.count_nonzero(missing))):
+            for tile in tiles:
+                number = surfaces.number[np.ix_(tile.y, tile.x)]
+                for label in tile.labels:
+                    wanted = (number == label) & missing[tile.place]
+                    joined = _joined(surfaces.shown[np.ix_(range(4), tile.y, tile.x)])
+                    known = (codes[tile.place] == Status.OK) & np.isfinite(maps["depth"][tile.place])
+                    if ring(wanted, known, joined)[0].size:
+                        self._refine_label(tile, surfaces, label, frame, maps, codes, wanted, True)
+                        missing[tile.place] &= ~(wanted & np.isin(codes[tile.place], HAS_VALUE))
+
+    def _refine_label(
+        self, tile: _Tile, surfaces: Surfaces, label: int, frame: int, maps: Maps, codes: Codes, mine: Mask,
+        beyond: bool,
     ) -> None:  # fmt: skip
-        """Refine the pixels of a tile that took one label, in place."""
-        plan, mine = self.plan, chosen[tile.place] == label
-        if plan.refine is None or not (mine & (codes[tile.place] == Status.OK)).any():
-            return
+        """Refine the pixels ``mine`` of a tile with the images that one label aims at, in place. ``beyond``: pixels
+        without values, from their neighbours."""
+        plan = self.plan
         stay = self._stay(tile, surfaces, surfaces.aims[label], frame)
         self._frames(stay, partial(self.pipeline.stays.refine_alone, stay))
         assert stay.engine.refine is not None
+        assert plan.refine is not None
         part = {name: values[tile.place].copy() for name, values in maps.items()}
-        status = np.where(mine, codes[tile.place], np.uint8(Status.NOT_COMPUTED))
         place = Place(tile.y, tile.x, (stay.wide.y, stay.wide.x), plan.geometry)
-        self.pipeline.effort += refine_maps(stay.engine.refine, plan.refine, part, status, place)
+        status = codes[tile.place].copy()
+        if beyond:
+            joined = _joined(surfaces.shown[np.ix_(range(4), tile.y, tile.x)])
+            effort = refine_beyond(stay.engine.refine, plan.refine, part, status, place, mine, joined)
+        else:
+            status[~mine] = Status.NOT_COMPUTED
+            effort = refine_maps(stay.engine.refine, plan.refine, part, status, place)
+        self.pipeline.effort += effort
         codes[tile.place][mine] = status[mine]
         for name, values in part.items():
             maps[name][tile.place][mine] = values[mine]

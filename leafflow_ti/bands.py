@@ -15,12 +15,12 @@ from leafflow_ti.models import TensorLayout
 from leafflow_ti.range_plan import RangePlan
 from leafflow_ti.refine_plan import Refinement
 from leafflow_ti.runtime import DENSE_LANES, usable_threads
+from leafflow_ti.search import peak_bytes
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.planes import round_up
 from leafflow_ti.stages.prefilter import prefilter_bytes
 from leafflow_ti.stages.problem import Problem
 from leafflow_ti.stages.refine_tables import Workspaces, bytes_per_pixel
-from leafflow_ti.search import search_bytes
 from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
@@ -98,7 +98,7 @@ class Demand:
         unit = rows * self.cols * (4 * self.n_maps + 1)
         if self.tile_cols:
             maps = 2 * self.n_maps + MAPS_BESIDE  # standard errors, and what growth is made of
-            total += search_bytes(self.image) + 4 * maps * (LABELS_AT_ONCE * band.rows * band.cols + rows * self.cols)
+            total += peak_bytes(self.image) + 4 * maps * (LABELS_AT_ONCE * band.rows * band.cols + rows * self.cols)
             total += self.n_cameras * in_rows * in_cols * HIDING_BYTES
         # One frame and one unit are worked on, and one unit is being written.
         return total + (1 + ahead) * block + (2 + WRITE_BEHIND) * unit

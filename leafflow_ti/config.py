@@ -44,8 +44,12 @@ Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 
 
 class RunConfig(Section):
-    """A whole run. ``preshift``: whole pixels per camera step; ``auto``: ``uniform``, one found in the images, where it
-    serves nearly all of them, else ``adaptive``: by a search of every frame, motion included. A preset decides ``precision`` unless it is given itself, and what ``resolve`` does."""
+    """A whole run.
+
+    ``preshift``: whole pixels per camera step; ``uniform``: found in the images; ``adaptive``: what a search of every
+    frame finds for each pixel, whole-pixel motion included; ``auto``: uniform where that serves nearly all of the
+    images, else adaptive. A preset decides ``precision`` unless it is given itself, and what ``resolve`` does.
+    """
 
     preset: Preset = "balanced"
     precision: Precision = "f32"

@@ -298,7 +298,9 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     depths = (0,) if isinstance(capture, ArrayCapture) else range(READ_AHEAD, -1, -1)
     demand = Demand(config, problem, layout, ranges, refine, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))
     if adaptive:
-        demand = replace(demand, tile_cols=min(len(x), -(-TILE_PIXELS // stride)), image=(capture.height, capture.width))
+        demand = replace(
+            demand, tile_cols=min(len(x), -(-TILE_PIXELS // stride)), image=(capture.height, capture.width)
+        )
     band_rows, memory, ahead = choose_bands(demand, len(y), depths)
     plan = replace(plan, band_rows=band_rows, bytes=memory, read_ahead=ahead, tile_cols=demand.tile_cols)
     cache = capture.cacheable_bytes if plan.bands > 1 or adaptive else 0

@@ -113,6 +113,14 @@ def coarse_search(
     return Coarse(disparity, motion, known)
 
 
+def peak_bytes(image: tuple[int, int]) -> int:
+    """Memory of a search in images [rows, cols], at most: two volumes, features of all views, and the images."""
+    reduction = max(1.0, image[0] * image[1] * SLOTS / VOLUME)
+    pixels = int(image[0] * image[1])
+    views = (4 * REACH + 1) * 2 * 4 * pixels / reduction
+    return int(2 * 4 * min(VOLUME, pixels * MOST_LABELS) + 2 * views + 40 * pixels)
+
+
 def noise_floor(image: Image) -> float:
     """Standard deviation [grey] below which texture counts as noise: from the finest differences of the image."""
     values = np.where(np.isfinite(image), image, np.nanmean(image)).astype(np.float64)

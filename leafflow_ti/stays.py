@@ -128,8 +128,7 @@ class Stays:
         hidden = stay.hidden(t, stay.wide) if stay.hidden else None
         if not engine.refine:
             return block, finite, hidden
-        valid = finite & self._seen(stay.wide, stay, t)
-        engine.refine.push(block, valid if hidden is None else valid & ~hidden)
+        engine.refine.push(block, finite & self._seen(stay.wide, stay, t), hidden)
         within = (..., *stay.inner)
         return np.ascontiguousarray(block[within]), finite[within], None if hidden is None else hidden[within]
 

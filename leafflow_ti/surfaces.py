@@ -80,7 +80,7 @@ class Surfaces:
         return out[1:-1, 1:-1]
 
     def hidden(self, aim: Aim, frame: int, t: int, box: Box) -> Mask | None:
-        """Where another surface hides that of a label in the images of frame ``t``: [sy, sx, rows, cols]; None: nowhere.
+        """Where another surface hides a label's in the images of frame ``t``, [sy, sx, rows, cols]; None: nowhere.
 
         What is nearer hides; with one camera, which knows no depth, everything else that moves otherwise may.
         """
@@ -100,7 +100,8 @@ class Surfaces:
             device.array(regions.ravel(), "int"), device.array(views.ravel()), device.array(_vector(aim)),
             device.array(nearness.ravel()), self._on_device, marks,
         )  # fmt: skip
-        return np.asarray(device.host(marks), np.int32).reshape(shape) != 0
+        found: Mask = device.host(marks).reshape(shape) != 0
+        return found
 
     @cached_property
     def _on_device(self) -> Any:

@@ -127,7 +127,8 @@ Preshift = Annotated[
     ),
 ]
 DisparityRange = Annotated[
-    str | None, _text("disparity-range", "auto|A,B", "Disparities that the search looks at, as seen, px per step [auto].")
+    str | None,
+    _text("disparity-range", "auto|A,B", "Disparities that the search looks at, px per step [auto]."),
 ]
 MotionRange = Annotated[
     str | None, _text("motion-range", "auto|PX", "Largest motion that the search looks at, px/frame [auto: 24].")

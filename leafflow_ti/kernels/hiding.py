@@ -5,6 +5,7 @@ import functools
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
+
 @functools.cache
 def hiding_kernel(spec: KernelSpec):
     """Marks the pixels of the images of a block on which nearer surfaces lie.

@@ -102,8 +102,9 @@ class RefineStage:
         self._slots.clear()
         self._next = 0
 
-    def push(self, block: Array, finite: NDArray[np.bool_]) -> None:
-        """Take the next frame: images [sy, sx, rows, cols] and where each is a grey value of an image."""
+    def push(self, block: Array, finite: NDArray[np.bool_], hidden: NDArray[np.bool_] | None = None) -> None:
+        """Take the next frame: images [sy, sx, rows, cols], where each is a grey value of an image, and where it shows
+        something else than the surface (None: nowhere)."""
         from leafflow_ti.kernels.refine_tables import NOTHING
 
         n = len(self.plan.cameras)
@@ -116,7 +117,20 @@ class RefineStage:
                 gaps = self._gaps[k]
                 if gaps is None or not np.array_equal(gaps.valid, valid[k]):
                     self._gaps[k] = gaps = Gaps.of(valid[k], self.pitch, filter_radius(self.plan.degree))
-                self._filter(images[k], gaps, (slot * n + k) * self._plane, NOTHING)
+                at = (slot * n + k) * self._plane
+                self._filter(images[k], gaps, at, NOTHING)
+                if hidden is not None and (beside := hidden.reshape(images.shape)[k]).any():
+                    self._take_out(beside, at, NOTHING)
+
+    def _take_out(self, hidden: NDArray[np.bool_], at: int, nothing: float) -> None:
+        """Let nothing be sampled from where the image shows something else."""
+        if self.device.gpu:
+            plane = self.device.host(self._coefficients)[at : at + self._plane].copy()
+            plane.reshape(self.rows, self.pitch)[:, : self.cols][hidden] = nothing
+            self.device.write(self._coefficients, at, plane)
+        else:
+            plane = self._coefficients[at : at + self._plane].reshape(self.rows, self.pitch)
+            plane[:, : self.cols][hidden] = nothing
 
     def _filter(self, image: Array, gaps: Gaps, to: int, nothing: float) -> None:
         """Spline coefficients of one image; those without a meaning are ``nothing``."""
