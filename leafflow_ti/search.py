@@ -155,8 +155,8 @@ class _Search:
     floor: float
 
     def prepared(self, t: int, row: int, col: int, scale: int, costs: Costs) -> Image:
-        """Features [channels, rows, cols] of one image at reduced resolution."""
-        return features(self.grey(t, row, col, scale), costs.radii, self.floor)
+        """Features [2, rows, cols] of one image at reduced resolution."""
+        return features(self.grey(t, row, col, scale), costs.radius, self.floor)
 
     def grey(self, t: int, row: int, col: int, scale: int) -> Image:
         """One image at reduced resolution, its mean in place of values that are not finite."""
@@ -259,12 +259,12 @@ class _Flow(_Search):
                 signs.append(float(sign))
         views = Views.of([[(sign, sign)] for sign in signs])
         reach = max(1, int(np.ceil(most / scale)))
-        middle = self.prepared(self.frame, *self.reference, scale, costs)[-1]
-        others = [self.prepared(*key, scale, costs)[-1] for key in keys]
-        labels = tiled(proposals(middle, others, signs, reach), CANDIDATE_TILE, middle.shape, reach)
+        middle = self.prepared(self.frame, *self.reference, scale, costs)
+        others = [self.prepared(*key, scale, costs) for key in keys]
+        labels = tiled(proposals(middle, others, signs, reach), CANDIDATE_TILE, middle.shape[1:], reach)
         for tile, unit in REFINING:
             found = self.choose(scale, keys, views, labels, costs)
-            labels = tiled(votes(found.displacement / unit, tile), tile, middle.shape, reach, unit)
+            labels = tiled(votes(found.displacement / unit, tile), tile, middle.shape[1:], reach, unit)
         found = self.choose(scale, keys, views, labels, costs)
         shape = (self.extent.height, self.extent.width)
         motion = np.stack([enlarged(m, scale, shape) for m in found.displacement]) * np.float32(scale)
@@ -274,24 +274,26 @@ class _Flow(_Search):
 def proposals(middle: Image, others: list[Image], signs: list[float], reach: int) -> list[NDArray[np.int64]]:
     """Candidates [n, 2] (x, y) of each tile of ``CANDIDATE_TILE`` px: highest peaks of the correlation of a window of
     ``CORRELATED`` px around it with the images before (sign -1) and behind (sign 1), up to ``reach`` px."""
-    rows, cols = middle.shape
+    rows, cols = middle.shape[1:]
     half, size = CORRELATED // 2, CORRELATED + 2 * reach
     pad = half + reach
     hann = np.sin(np.pi * (np.arange(CORRELATED) + 0.5) / CORRELATED) ** 2
     window = np.outer(hann, hann)
-    shape = (size + CORRELATED, size + CORRELATED)
-    padded = [np.pad(image, pad) for image in (middle, *others)]
+    # The product of one complex number and another's conjugate holds the products of their gradients.
+    here, *there = (np.pad(image[0] + 1j * image[1], pad) for image in (middle, *others))
     found = []
     for y in range(CANDIDATE_TILE // 2, rows + CANDIDATE_TILE // 2, CANDIDATE_TILE):
         for x in range(CANDIDATE_TILE // 2, cols + CANDIDATE_TILE // 2, CANDIDATE_TILE):
-            top, left = min(y, rows - 1) + pad - half, min(x, cols - 1) + pad - half
-            here = padded[0][top : top + CORRELATED, left : left + CORRELATED] * window
-            spectrum = np.conj(np.fft.rfft2(here, shape))
+            top, left = min(y, rows - 1) + reach, min(x, cols - 1) + reach
+            part = np.zeros((size, size), np.complex128)
+            part[:CORRELATED, :CORRELATED] = here[top : top + CORRELATED, left : left + CORRELATED] * window
+            spectrum = np.conj(np.fft.fft2(part))
             total = np.zeros((2 * reach + 1, 2 * reach + 1))
-            for image, sign in zip(padded[1:], signs, strict=True):
-                there = image[top - reach : top + CORRELATED + reach, left - reach : left + CORRELATED + reach]
-                part = np.fft.irfft2(spectrum * np.fft.rfft2(there, shape), shape)[: 2 * reach + 1, : 2 * reach + 1]
-                total += part if sign > 0.0 else part[::-1, ::-1]
+            for image, sign in zip(there, signs, strict=True):
+                block = image[top - reach : top - reach + size, left - reach : left - reach + size]
+                # Cyclic, and free of wrapping for the lags up to twice ``reach`` that are kept.
+                lags = np.fft.ifft2(spectrum * np.fft.fft2(block)).real[: 2 * reach + 1, : 2 * reach + 1]
+                total += lags if sign > 0.0 else lags[::-1, ::-1]
             found.append(_peaks(total, PEAKS) - reach)
     return found
 

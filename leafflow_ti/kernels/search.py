@@ -2,8 +2,9 @@
 
 *Labels* are candidate displacements ``(x, y)``; every square *tile* of the image has its own list of at most ``slots``
 of them. *Views* are images that see a label as the displacement ``(x fx, y fy)``, each with its factors ``f``; views
-on one side of the reference form an *arm*. What is occluded on one side is mostly seen from the other: the cost of a
-label is the mean over the better half of the arms of the mean over their views of the truncated difference of features.
+on one side of the reference form an *arm*. The cost of a label in an arm is the mean over its views of the truncated
+difference of features, averaged over the *support* of the pixel: the pixels around that look like it. What is occluded on
+one side is mostly seen from the other: the better half of the arms decides.
 
 The aggregation is that of Hirschmüller (semi-global matching, 2008): along straight paths the least sum of costs, and
 of penalties ``p1`` between neighbouring labels and ``p2`` between any others; lower where the image has an edge.
@@ -22,7 +23,7 @@ SIDES = 4
 
 @functools.cache
 def _formulas(spec: KernelSpec):
-    """Functions of one pixel: ``costs`` and ``winner``; of one path: ``path``."""
+    """Functions of one pixel: ``costs``, ``support`` and ``winner``; of one path: ``path``."""
     real = spec.real
 
     @ti.func
@@ -50,35 +51,68 @@ def _formulas(spec: KernelSpec):
     def costs(
         pixel: ti.i32, rows: ti.i32, cols: ti.i32, channels: ti.i32, n_arms: ti.i32, tile: ti.i32, tiles_x: ti.i32,
         slots: ti.i32, most: real, count: ti.template(), label: ti.template(), arm: ti.template(),
-        factor: ti.template(), mask: ti.template(), feature: ti.template(), cost: ti.template(),
+        factor: ti.template(), feature: ti.template(), cost: ti.template(),
     ):  # fmt: skip
+        """Costs of the labels in every arm; ``most`` where no view of the arm shows the place."""
         y = pixel // cols
         x = pixel - y * cols
         here = (y // tile) * tiles_x + x // tile
-        for k in range(slots):
-            value = ti.cast(0.0, real)
-            if mask[pixel] > 0 and k < count[here]:
+        for a in range(n_arms):
+            for k in range(count[here]):
                 lx, ly = label[(here * slots + k) * 2], label[(here * slots + k) * 2 + 1]
-                best, second = most, most
-                seen = 0
-                for a in range(n_arms):
-                    total = ti.cast(0.0, real)
-                    views = 0
-                    for v in range(arm[a], arm[a + 1]):
-                        sx = ti.cast(x, real) + lx * factor[2 * v]
-                        sy = ti.cast(y, real) + ly * factor[2 * v + 1]
-                        if sx >= 0.0 and sx <= ti.cast(cols - 1, real) and sy >= 0.0 and sy <= ti.cast(rows - 1, real):
-                            total += difference(pixel, v, sx, sy, rows, cols, channels, most, feature)
-                            views += 1
-                    if views > 0:
-                        seen += 1
-                        mean = total / ti.cast(views, real)
-                        second = ti.min(second, ti.max(mean, best))
-                        best = ti.min(best, mean)
-                value = best
-                if seen > 2:
-                    value = (best + second) / ti.cast(2.0, real)
-            cost[pixel * slots + k] = value
+                total = ti.cast(0.0, real)
+                seen = ti.cast(0.0, real)
+                for v in range(arm[a], arm[a + 1]):
+                    sx = ti.cast(x, real) + lx * factor[2 * v]
+                    sy = ti.cast(y, real) + ly * factor[2 * v + 1]
+                    if sx >= 0.0 and sx <= ti.cast(cols - 1, real) and sy >= 0.0 and sy <= ti.cast(rows - 1, real):
+                        total += difference(pixel, v, sx, sy, rows, cols, channels, most, feature)
+                        seen += 1.0
+                cost[(a * rows * cols + pixel) * slots + k] = ti.select(seen > 0.0, total / ti.max(seen, 1.0), most)
+
+    @ti.func
+    def support(
+        pixel: ti.i32, task: ti.i32, rows: ti.i32, cols: ti.i32, n_arms: ti.i32, radius: ti.i32, tile: ti.i32,
+        tiles_x: ti.i32, slots: ti.i32, scale: real, count: ti.template(), near: ti.template(), guide: ti.template(),
+        mask: ti.template(), arm_cost: ti.template(), place: ti.template(), weight: ti.template(), cost: ti.template(),
+    ):  # fmt: skip
+        """Costs of the labels over the pixel's support, mean over the better half of the arms; 0 where ``mask`` is 0."""
+        y = pixel // cols
+        x = pixel - y * cols
+        row, col = y // tile, x // tile
+        here = row * tiles_x + col
+        most = (2 * radius + 1) * (2 * radius + 1)
+        n = 0
+        mass = ti.cast(0.0, real)
+        for j in range(ti.max(y - radius, 0), ti.min(y + radius + 1, rows)):
+            for i in range(ti.max(x - radius, 0), ti.min(x + radius + 1, cols)):
+                if mask[j * cols + i] > 0:
+                    w = ti.exp(-ti.abs(guide[j * cols + i] - guide[pixel]) / scale)
+                    place[(task * most + n) * 2] = j * cols + i
+                    place[(task * most + n) * 2 + 1] = 4 + 3 * (j // tile - row) + i // tile - col
+                    weight[task * most + n] = w
+                    mass += w
+                    n += 1
+        for k in range(count[here]):
+            best, second = ti.cast(1e30, real), ti.cast(1e30, real)
+            for a in range(n_arms):
+                total = ti.cast(0.0, real)
+                found = mass
+                for m in range(task * most, task * most + n):
+                    slot = k
+                    if place[2 * m + 1] != 4:
+                        slot = near[((here * NEAR + place[2 * m + 1]) * slots + k) * NEAR]
+                    if slot >= 0:
+                        total += weight[m] * arm_cost[(a * rows * cols + place[2 * m]) * slots + slot]
+                    else:
+                        found -= weight[m]
+                mean = total / ti.max(found, 1e-6)
+                second = ti.min(second, ti.max(mean, best))
+                best = ti.min(best, mean)
+            value = best
+            if n_arms > 2:
+                value = (best + second) / ti.cast(2.0, real)
+            cost[pixel * slots + k] = ti.select(mask[pixel] > 0, value, ti.cast(0.0, real))
 
     @ti.func
     def start_of(line: ti.i32, rows: ti.i32, cols: ti.i32, step_y: ti.i32, step_x: ti.i32):
@@ -168,17 +202,17 @@ def _formulas(spec: KernelSpec):
                     value += off * (label[(at + two) * 2 + axis] - label[(at + one) * 2 + axis]) / ti.cast(2.0, real)
             found[axis * rows * cols + pixel] = value
 
-    return costs, path, winner
+    return costs, support, path, winner
 
 
 @functools.cache
 def costs_kernel(spec: KernelSpec):
-    """``cost[pixel, slot]`` of every label of the pixel's tile; 0 in slots without label and where ``mask`` is 0."""
-    costs, _, _ = _formulas(spec)
+    """Costs in every arm of every label of the pixel's tile."""
+    costs, _, _, _ = _formulas(spec)
     real = spec.real
 
     @ti.kernel
-    def label_costs(
+    def arm_costs(
         rows: ti.i32,
         cols: ti.i32,
         channels: ti.i32,
@@ -192,34 +226,77 @@ def costs_kernel(spec: KernelSpec):
         label_in: ti.types.ndarray(dtype=real, ndim=1),  # [tiles, slots, 2]
         arm_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [n_arms + 1]
         factor_in: ti.types.ndarray(dtype=real, ndim=1),  # [views, 2]
-        mask_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [rows, cols]
         feature_in: ti.types.ndarray(dtype=real, ndim=1),  # [1 + views, channels, rows, cols]
-        cost_out: ti.types.ndarray(dtype=real, ndim=1),  # [rows, cols, slots]
+        arm_cost_out: ti.types.ndarray(dtype=real, ndim=1),  # [n_arms, rows, cols, slots]
     ):
         size = rows * cols
         if ti.static(spec.gpu):
             for p in range(size):
                 costs(
                     p, rows, cols, channels, n_arms, tile, tiles_x, slots, most, count_in, label_in, arm_in, factor_in,
-                    mask_in, feature_in, cost_out,
+                    feature_in, arm_cost_out,
                 )  # fmt: skip
         else:
             for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
                 if part == 0:
-                    for y in range(task * rows // n_tasks, (task + 1) * rows // n_tasks):
-                        for p in range(y * cols, (y + 1) * cols):
-                            costs(
-                                p, rows, cols, channels, n_arms, tile, tiles_x, slots, most, count_in, label_in, arm_in,
-                                factor_in, mask_in, feature_in, cost_out,
-                            )  # fmt: skip
+                    for p in range(task * size // n_tasks, (task + 1) * size // n_tasks):
+                        costs(
+                            p, rows, cols, channels, n_arms, tile, tiles_x, slots, most, count_in, label_in, arm_in,
+                            factor_in, feature_in, arm_cost_out,
+                        )  # fmt: skip
 
-    return label_costs
+    return arm_costs
+
+
+@functools.cache
+def support_kernel(spec: KernelSpec):
+    """``cost[pixel, slot]`` over the support of each pixel, from all arms."""
+    _, support, _, _ = _formulas(spec)
+    real = spec.real
+
+    @ti.kernel
+    def support_costs(
+        rows: ti.i32,
+        cols: ti.i32,
+        n_arms: ti.i32,
+        radius: ti.i32,
+        tile: ti.i32,
+        tiles_x: ti.i32,
+        slots: ti.i32,
+        scale: real,
+        n_tasks: ti.i32,
+        count_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tiles]
+        near_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tiles, NEAR, slots, NEAR]
+        guide_in: ti.types.ndarray(dtype=real, ndim=1),  # [rows, cols]
+        mask_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [rows, cols]
+        arm_cost_in: ti.types.ndarray(dtype=real, ndim=1),  # [n_arms, rows, cols, slots]
+        place_tmp: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tasks, (2 radius + 1)², 2], tasks = pixels on a GPU
+        weight_tmp: ti.types.ndarray(dtype=real, ndim=1),  # [tasks, (2 radius + 1)²]
+        cost_out: ti.types.ndarray(dtype=real, ndim=1),  # [rows, cols, slots]
+    ):
+        size = rows * cols
+        if ti.static(spec.gpu):
+            for p in range(size):
+                support(
+                    p, p, rows, cols, n_arms, radius, tile, tiles_x, slots, scale, count_in, near_in, guide_in, mask_in,
+                    arm_cost_in, place_tmp, weight_tmp, cost_out,
+                )  # fmt: skip
+        else:
+            for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
+                if part == 0:
+                    for p in range(task * size // n_tasks, (task + 1) * size // n_tasks):
+                        support(
+                            p, task, rows, cols, n_arms, radius, tile, tiles_x, slots, scale, count_in, near_in,
+                            guide_in, mask_in, arm_cost_in, place_tmp, weight_tmp, cost_out,
+                        )  # fmt: skip
+
+    return support_costs
 
 
 @functools.cache
 def paths_kernel(spec: KernelSpec):
     """Adds the sums of costs along all paths of one direction to ``total``."""
-    _, path, _ = _formulas(spec)
+    _, _, path, _ = _formulas(spec)
     real = spec.real
 
     @ti.kernel
@@ -264,7 +341,7 @@ def paths_kernel(spec: KernelSpec):
 @functools.cache
 def winners_kernel(spec: KernelSpec):
     """Per pixel the best label's slot, its displacement with fraction, and its own cost."""
-    _, _, winner = _formulas(spec)
+    _, _, _, winner = _formulas(spec)
     real = spec.real
 
     @ti.kernel

@@ -25,15 +25,19 @@ NEAR, SIDES = 9, 4
 class Costs:
     """How labels are rated.
 
-    ``radii`` [px] of the box windows in which images are normalised; ``most`` largest difference that counts, in
-    standard deviations of these windows; ``small`` and ``large`` penalties between neighbouring and between other
-    labels.
+    ``radius`` [px] of the windows in which gradients are normalised; ``most`` largest difference that counts, in units
+    of the normalised gradient; ``small`` and ``large`` penalties between neighbouring and between other labels, halved
+    where neighbouring grey values differ by ``edge`` times what is typical; ``support`` [px] radius of a pixel's support,
+    in which weights fall by e where grey values differ by ``alike`` times what is typical.
     """
 
-    radii: tuple[int, ...] = (2, 7)
+    radius: int = 12
     most: float = 0.8
-    small: float = 0.5
-    large: float = 3.0
+    small: float = 0.3
+    large: float = 2.0
+    support: int = 2
+    alike: float = 3.0
+    edge: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,18 +142,17 @@ def box_mean(image: NDArray[Any], radius: int) -> NDArray[np.float64]:
     return result
 
 
-def features(image: Image, radii: tuple[int, ...], floor: float) -> Image:
-    """[radii, H, W]: the image less its local mean, in units of its local standard deviation.
+def features(image: Image, radius: int, floor: float) -> Image:
+    """[2, H, W]: the gradient (x, y) in units of its root mean square over windows of ``radius`` px.
 
-    ``floor`` [grey]: standard deviation that noise alone has; where the image has less, features fade to 0.
+    A gradient changes within a pixel of a surface's edge, where a window would reach across; the ratio does not depend
+    on slow changes of the light. ``floor`` [grey]: standard deviation of the noise; where the gradient is no more than
+    that of noise, features fade to 0.
     """
-    out = np.empty((len(radii), *image.shape), np.float32)
-    centred = image.astype(np.float64) - image.mean()
-    for feature, radius in zip(out, radii, strict=True):
-        mean = box_mean(centred, radius)
-        variance = np.maximum(box_mean(centred**2, radius) - mean**2, 0.0)
-        feature[:] = (centred - mean) / np.sqrt(variance + floor**2)
-    return out
+    along_y, along_x = np.gradient(image.astype(np.float64))
+    energy = box_mean(along_x**2 + along_y**2, radius) / 2.0
+    scale = 1.0 / np.sqrt(energy + floor**2 / 2.0)  # central differences halve the variance of noise
+    return np.stack([along_x * scale, along_y * scale]).astype(np.float32)
 
 
 def search_bytes(rows: int, cols: int, slots: int) -> int:
@@ -165,25 +168,30 @@ def search(
     ``stack`` [1 + views, channels, H, W] features, the reference first; ``guide`` [H, W] the image whose edges may be
     edges of surfaces, in units of a typical difference of neighbours; ``mask`` [H, W]: pixels that count.
     """
-    from leafflow_ti.kernels.search import costs_kernel, paths_kernel, winners_kernel
+    from leafflow_ti.kernels.search import costs_kernel, paths_kernel, support_kernel, winners_kernel
 
     spec = device.planes
     _, channels, rows, cols = stack.shape
     size, slots = rows * cols, labels.slots
     tables = (device.array(labels.count, "int"), device.array(labels.values))
-    cost, total = device.empty(size * slots), device.zeros(size * slots)
+    n_arms, n_tasks, side = len(views.arms) - 1, device.tasks(size), 2 * costs.support + 1
+    arm_cost, cost, total = device.empty(n_arms * size * slots), device.empty(size * slots), device.zeros(size * slots)
     costs_kernel(spec)(
-        rows, cols, channels, len(views.arms) - 1, labels.tile, labels.tiles_x, slots, costs.most, device.tasks(rows),
-        *tables, device.array(views.arms, "int"), device.array(views.factors), device.array(mask, "int"),
-        device.array(stack), cost,
+        rows, cols, channels, n_arms, labels.tile, labels.tiles_x, slots, costs.most, n_tasks, *tables,
+        device.array(views.arms, "int"), device.array(views.factors), device.array(stack), arm_cost,
     )  # fmt: skip
     near, greys = device.array(labels.near(), "int"), device.array(guide)
+    scratch = (size if device.gpu else n_tasks) * side**2
+    support_kernel(spec)(
+        rows, cols, n_arms, costs.support, labels.tile, labels.tiles_x, slots, costs.alike, n_tasks, tables[0], near,
+        greys, device.array(mask, "int"), arm_cost, device.empty(2 * scratch, "int"), device.empty(scratch), cost,
+    )  # fmt: skip
     most_lines = rows + cols - 1
     behind = device.empty(2 * most_lines * slots)
     for step_y, step_x in DIRECTIONS:
         n_lines = rows if step_y == 0 else cols if step_x == 0 else most_lines
         paths_kernel(spec)(
-            n_lines, rows, cols, step_y, step_x, labels.tile, labels.tiles_x, slots, costs.small, costs.large, 1.0,
+            n_lines, rows, cols, step_y, step_x, labels.tile, labels.tiles_x, slots, costs.small, costs.large, costs.edge,
             device.tasks(n_lines), tables[0], near, greys, cost, behind, total,
         )  # fmt: skip
     chosen, found, price = device.empty(size, "int"), device.empty(2 * size), device.empty(size)
