@@ -9,14 +9,13 @@ status says ``contested``.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.aim import Aim
 from leafflow_ti.capture import Capture
 from leafflow_ti.field import empty_map
 from leafflow_ti.pipeline import Pipeline
@@ -27,7 +26,7 @@ from leafflow_ti.search import Extent, coarse_search
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.status import HAS_VALUE, Status
 from leafflow_ti.stays import Maps, Stay, without_images
-from leafflow_ti.surfaces import EDGE, REACH, Surfaces, dilated
+from leafflow_ti.surfaces import EDGE, REACH, Surfaces, dilated, vector
 from leafflow_ti.trace import span
 
 Codes = NDArray[np.uint8]
@@ -46,6 +45,21 @@ class _Tile:
     y: range
     x: range
     labels: tuple[int, ...]
+    """The most frequent first."""
+
+    def groups(self, surfaces: Surfaces) -> list[list[int]]:
+        """The labels in groups of which all are within a pixel of the first: the refinement, which knows no filters,
+        sees all of them in the images that the first one aims at."""
+        found: list[list[int]] = []
+        for label in self.labels:
+            aim = vector(surfaces.aims[label])
+            near = (g for g in found if np.abs(vector(surfaces.aims[g[0]]) - aim).max() <= 1)
+            group = next(near, None)
+            if group is None:
+                found.append([label])
+            else:
+                group.append(label)
+        return found
 
     @property
     def place(self) -> tuple[slice, slice]:
@@ -105,16 +119,17 @@ class Adaptive:
         found = []
         for first in range(0, len(x), self.plan.tile_cols):
             cols = slice(first, min(first + self.plan.tile_cols, len(x)))
-            labels = np.unique(surfaces.number[np.ix_(y, x[cols])])
-            found.append(_Tile(slice(0, len(y)), cols, y, x[cols], tuple(int(n) for n in labels)))
+            labels, counts = np.unique(surfaces.number[np.ix_(y, x[cols])], return_counts=True)
+            order = np.argsort(-counts, kind="stable")
+            found.append(_Tile(slice(0, len(y)), cols, y, x[cols], tuple(int(n) for n in labels[order])))
         return found
 
-    def _stay(self, tile: _Tile, surfaces: Surfaces, aim: Aim, frame: int) -> Stay:
-        """The engine at a tile, to see one label's surface alone."""
-        pipeline = self.pipeline
+    def _stay(self, tile: _Tile, surfaces: Surfaces, group: Sequence[int], frame: int) -> Stay:
+        """The engine at a tile, aimed at the first of some labels, to see their surface alone."""
+        pipeline, aims = self.pipeline, [surfaces.aims[label] for label in group]
         return pipeline.stays.move(
-            pipeline.engine(self._band), self._band, (tile.x[0], tile.y[0]), aim, frame,
-            partial(surfaces.layer, aim), partial(surfaces.hidden, aim, frame),
+            pipeline.engine(self._band), self._band, (tile.x[0], tile.y[0]), aims[0], frame,
+            partial(surfaces.layer, aims), partial(surfaces.hidden, aims[0], frame),
         )  # fmt: skip
 
     def _frames(self, stay: Stay, each: Callable[[int, NDArray[np.float32], Mask], None]) -> None:
@@ -128,12 +143,12 @@ class Adaptive:
     def _pass(self, tile: _Tile, surfaces: Surfaces, label: int, frame: int) -> tuple[Maps, Codes]:
         """Maps and status of a tile as one label sees them."""
         stays, samples = self.pipeline.stays, []
-        stay = self._stay(tile, surfaces, surfaces.aims[label], frame)
+        stay = self._stay(tile, surfaces, (label,), frame)
         tensors = None
 
         def push(t: int, block: NDArray[np.float32], finite: Mask) -> None:
             nonlocal tensors
-            sample, tensors = stays.push(stay, t, block, finite)
+            sample, tensors = stays.push(stay, t, block, finite, refining=False)
             if t == frame:
                 samples.append(without_images(sample))
 
@@ -165,10 +180,10 @@ class Adaptive:
     ) -> None:
         """Refine a band's pixels, then those that no pass had values for, from tile to tile as far as they lead."""
         for tile in tiles:
-            for label in tile.labels:
-                mine = chosen[tile.place] == label
+            for group in tile.groups(surfaces):
+                mine = np.isin(chosen[tile.place], group)
                 if (mine & (codes[tile.place] == Status.OK)).any():
-                    self._refine_label(tile, surfaces, label, frame, maps, codes, mine, False)
+                    self._refine_group(tile, surfaces, group, frame, maps, codes, mine, False)
         missing = np.zeros(codes.shape, np.bool_)
         for tile in tiles:
             missing[tile.place] = surfaces.known[np.ix_(tile.y, tile.x)]
@@ -177,22 +192,22 @@ class Adaptive:
         while before != (before := int(np.count_nonzero(missing))):
             for tile in tiles:
                 number = surfaces.number[np.ix_(tile.y, tile.x)]
-                for label in tile.labels:
-                    wanted = (number == label) & missing[tile.place]
+                for group in tile.groups(surfaces):
+                    wanted = np.isin(number, group) & missing[tile.place]
                     joined = _joined(surfaces.shown[np.ix_(range(4), tile.y, tile.x)])
                     known = (codes[tile.place] == Status.OK) & np.isfinite(maps["depth"][tile.place])
                     if ring(wanted, known, joined)[0].size:
-                        self._refine_label(tile, surfaces, label, frame, maps, codes, wanted, True)
+                        self._refine_group(tile, surfaces, group, frame, maps, codes, wanted, True)
                         missing[tile.place] &= ~(wanted & np.isin(codes[tile.place], HAS_VALUE))
 
-    def _refine_label(
-        self, tile: _Tile, surfaces: Surfaces, label: int, frame: int, maps: Maps, codes: Codes, mine: Mask,
+    def _refine_group(
+        self, tile: _Tile, surfaces: Surfaces, group: list[int], frame: int, maps: Maps, codes: Codes, mine: Mask,
         beyond: bool,
     ) -> None:  # fmt: skip
-        """Refine the pixels ``mine`` of a tile with the images that one label aims at, in place. ``beyond``: pixels
-        without values, from their neighbours."""
+        """Refine the pixels ``mine`` of a tile with the images that a group of labels aims at, in place. ``beyond``:
+        pixels without values, from their neighbours."""
         plan = self.plan
-        stay = self._stay(tile, surfaces, surfaces.aims[label], frame)
+        stay = self._stay(tile, surfaces, group, frame)
         self._frames(stay, partial(self.pipeline.stays.refine_alone, stay))
         assert stay.engine.refine is not None
         assert plan.refine is not None
@@ -237,7 +252,7 @@ def _best(passes: list[tuple[Maps, Codes]], tile: _Tile, surfaces: Surfaces) -> 
     around = -(-EDGE // tile.x.step)
     for n, label in enumerate(tile.labels):
         aim = surfaces.aims[label]
-        away = np.abs(shown - np.array([*aim.shift, *aim.motion])[:, None, None]).max(axis=0)
+        away = np.abs(shown - vector(aim)[:, None, None]).max(axis=0)
         meant = (away <= REACH) | dilated(number == label, around)
         confidence = np.where(valued[n] & meant, np.nan_to_num(passes[n][0]["confidence"]), -1.0)
         better = missing & (confidence > best)

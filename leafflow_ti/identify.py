@@ -52,7 +52,8 @@ class Limits:
         if stem in ("velocity", "acceleration"):
             return distance / (self.radius_px if axis == "z" else self.f_px)
         if name in ("brightness_world_x", "brightness_world_y"):
-            return self.f_px / (self.radius_px * distance)
+            with np.errstate(divide="ignore"):  # no depth yet: no limit
+                return self.f_px / (self.radius_px * distance)
         if stem == "rotation":
             return np.where(np.isfinite(distance), 1 / self.radius_px if axis == "z" else 1.0, np.nan)
         return 1 / self.radius_px if name in ("brightness_tx", "brightness_ty") else 1.0

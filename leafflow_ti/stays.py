@@ -108,9 +108,14 @@ class Stays:
             engine, aim, wide.widened(margin), wide, block, inner, allowed, centre, frame, shown, hidden
         )  # fmt: skip
 
-    def push(self, stay: Stay, t: int, block: NDArray[Any], finite: Mask) -> tuple[Sample, Any | None]:
-        """Add a frame, as it was read, to the engine: what it was, and the tensors once the windows are full."""
-        sample = self._sample(stay, t, *self._prepared(stay, t, block, finite))
+    def push(
+        self, stay: Stay, t: int, block: NDArray[Any], finite: Mask, refining: bool = True
+    ) -> tuple[Sample, Any | None]:
+        """Add a frame, as it was read, to the engine: what it was, and the tensors once the windows are full.
+
+        ``refining``: whether the refinement takes it, too.
+        """
+        sample = self._sample(stay, t, *self._prepared(stay, t, block, finite, refining))
         return sample, stay.engine.push(sample)
 
     def refine_alone(self, stay: Stay, t: int, block: NDArray[Any], finite: Mask) -> None:
@@ -118,7 +123,7 @@ class Stays:
         self._prepared(stay, t, block, finite)
 
     def _prepared(
-        self, stay: Stay, t: int, block: NDArray[Any], finite: Mask
+        self, stay: Stay, t: int, block: NDArray[Any], finite: Mask, refining: bool = True
     ) -> tuple[NDArray[Any], Mask, Mask | None]:
         """One frame's images and where they are finite, prefiltered, as the tensors take them; what hides the surface
         in them. The refinement takes its wider ones."""
@@ -128,7 +133,8 @@ class Stays:
         hidden = stay.hidden(t, stay.wide) if stay.hidden else None
         if not engine.refine:
             return block, finite, hidden
-        engine.refine.push(block, finite & self._seen(stay.wide, stay, t), hidden)
+        if refining:
+            engine.refine.push(block, finite & self._seen(stay.wide, stay, t), hidden)
         within = (..., *stay.inner)
         return np.ascontiguousarray(block[within]), finite[within], None if hidden is None else hidden[within]
 

@@ -40,9 +40,10 @@ class Surfaces:
     ):  # fmt: skip
         self.device, self.known = device, coarse.known
         shape = coarse.disparity.shape
-        per_step = extent.per_step(coarse.disparity.ravel().astype(np.float64)).T.reshape(2, *shape)
-        for axis, count in enumerate((extent.n_cols, extent.n_rows)):
-            per_step[axis] *= count > 1
+        per_step = np.zeros((2, *shape))
+        several = [extent.n_cols > 1, extent.n_rows > 1]
+        if any(several):
+            per_step[several] = extent.per_step(coarse.disparity.ravel()).T.reshape(2, *shape)[several]
         self.shown: Floats = np.concatenate([per_step, coarse.motion]).astype(np.float32)
         """[4, H, W]: disparity along x and y [px/step], motion along x and y [px/frame]."""
         self.aims, self.number = _labels(self.shown)
@@ -66,16 +67,17 @@ class Surfaces:
                 found[tuple(at)] |= step
         return dilated(found, reach - 1)
 
-    def layer(self, aim: Aim, box: Box) -> Mask:
-        """Where the surface of a label is, in a block of the reference image; False beyond the image.
+    def layer(self, aims: Sequence[Aim], box: Box) -> Mask:
+        """Where the surface of some labels is, in a block of the reference image; False beyond the image.
 
         The outermost pixel of it is left out, where filters and the search see both surfaces.
         """
         wide = box.widened(1)
         out = np.zeros((wide.rows, wide.cols), np.bool_)
         rows, cols, inner = _overlap(wide, self.number.shape)
-        away = np.abs(self.shown[:, rows, cols] - _vector(aim)[:, None, None]).max(axis=0)
-        other = (away > REACH) | ~self.known[rows, cols]
+        shown, other = self.shown[:, rows, cols], ~self.known[rows, cols]
+        within = [np.abs(shown - vector(aim)[:, None, None]).max(axis=0) <= REACH for aim in aims]
+        other = other | ~np.logical_or.reduce(within)
         out[inner] = ~dilated(other, 1)
         return out[1:-1, 1:-1]
 
@@ -97,7 +99,7 @@ class Surfaces:
         marks = device.zeros(int(np.prod(shape)), "int")
         hiding_kernel(device.dense)(
             n, min(n, device.tasks(n)), *self.number.shape, box.y, box.x, box.rows, box.cols, least,
-            device.array(regions.ravel(), "int"), device.array(views.ravel()), device.array(_vector(aim)),
+            device.array(regions.ravel(), "int"), device.array(views.ravel()), device.array(vector(aim)),
             device.array(nearness.ravel()), self._on_device, marks,
         )  # fmt: skip
         found: Mask = device.host(marks).reshape(shape) != 0
@@ -109,7 +111,7 @@ class Surfaces:
 
     def _otherwise(self, aim: Aim) -> Floats:
         """How much pixels move otherwise than a label says."""
-        away = np.abs(self.shown[2:] - _vector(aim)[2:, None, None]).max(axis=0)
+        away = np.abs(self.shown[2:] - vector(aim)[2:, None, None]).max(axis=0)
         return np.where(self.known, away, np.float32(-1e9)).astype(np.float32)
 
     def _regions(self, aim: Aim, views: NDArray[np.float64], box: Box, hides: Mask) -> NDArray[np.int64]:
@@ -119,7 +121,7 @@ class Surfaces:
         if not rows.size:
             return regions
         of = self.shown[:, hides]
-        low, high = (f(of, axis=1) - _vector(aim) for f in (np.min, np.max))
+        low, high = (f(of, axis=1) - vector(aim) for f in (np.min, np.max))
         for k, (kx, ky, n) in enumerate(views.T):
             for axis, (step, first, size, at) in enumerate(((ky, box.y, box.rows, rows), (kx, box.x, box.cols, cols))):
                 d, m = 1 - axis, 3 - axis
@@ -145,7 +147,8 @@ def dilated(mask: Mask, radius: int) -> Mask:
     return mask
 
 
-def _vector(aim: Aim) -> Floats:
+def vector(aim: Aim) -> Floats:
+    """Of a label, in the order of ``Surfaces.shown``."""
     return np.array([*aim.shift, *aim.motion], np.float32)
 
 
