@@ -212,7 +212,8 @@ def test_simulate_leaves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     out = tmp_path / "l"
     options = (
         "--cameras 3 --frames 3 --size 60x50 --focal-px 500 --baseline-mm 4 --leaves 3 --disparity-px 2,9 "
-        "--motion-px 3 --light-change .02,.1,0 --offset 100 --contrast 20 --wavelength-px 6,30 --layout-seed 4 --supersampling 1"
+        "--motion-px 3 --light-change .02,.1,0 --offset 100 --contrast 20 --wavelength-px 6,30 "
+        "--layout-seed 4 --supersampling 1"
     )
     assert command("simulate", "leaves", out, *options.split()) == 0
     assert "--preshift" not in capsys.readouterr().out  # there is no one disparity
