@@ -15,8 +15,9 @@ from leafflow_ti.capture import open_capture
 from leafflow_ti.cli.main import main
 from leafflow_ti.errors import RunError, UsageError
 from leafflow_ti.metrics import read_truth
-from leafflow_ti.synthetic import cube, plane
+from leafflow_ti.synthetic import cube, leaves, plane
 from leafflow_ti.synthetic.cube import CubeScene
+from leafflow_ti.synthetic.leaves import LeavesScene
 from leafflow_ti.synthetic.plane import PlaneScene, sinusoid_scene
 from leafflow_ti.synthetic.write import image_pattern, write_scene
 
@@ -205,6 +206,39 @@ def test_simulate_cube(tmp_path: Path) -> None:
     stored_truth = np.load(out / "truth.npz")
     assert set(np.unique(stored_truth["face"])) == {0, 1, 2}
     np.testing.assert_array_equal(stored_truth["growth_rate"], np.where(stored_truth["face"] > 0, 0.0, np.nan))
+
+
+def test_simulate_leaves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "l"
+    options = (
+        "--cameras 3 --frames 3 --size 60x50 --focal-px 500 --baseline-mm 4 --leaves 3 --disparity-px 2,9 "
+        "--motion-px 3 --light-change .02,.1,0 --offset 100 --contrast 20 --wavelength-px 6,30 "
+        "--layout-seed 4 --supersampling 1"
+    )
+    assert command("simulate", "leaves", out, *options.split()) == 0
+    assert "--preshift" not in capsys.readouterr().out  # there is no one disparity
+    scene = LeavesScene(
+        n_cols=3,
+        n_frames=3,
+        size=(60, 50),
+        f_px=500.0,
+        baseline_mm=(4.0, 4.0),
+        leaves=3,
+        disparity_px=(2.0, 9.0),
+        motion_px=3.0,
+        light_change=(0.02, 0.1, 0.0),
+        offset=100.0,
+        contrast=20.0,
+        wavelengths_px=(6.0, 30.0),
+        layout_seed=4,
+        supersampling=1,
+    )
+    np.testing.assert_array_equal(
+        tifffile.imread(out / "cam_02" / "frame_001.tif"), leaves.render_image(scene, 1, 0, 2)
+    )
+    stored_truth = np.load(out / "truth.npz")
+    assert stored_truth["omega"].shape == (50, 60, 3)
+    np.testing.assert_array_equal(stored_truth["face"], leaves.truth(scene)["face"])
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,8 @@
 *Labels* are candidate displacements ``(x, y)``; every square *tile* of the image has its own list of at most ``slots``
 of them. *Views* are images that see a label as the displacement ``(x fx, y fy)``, each with its factors ``f``; views
 on one side of the reference form an *arm*. The cost of a label in an arm is the mean over its views of the truncated
-difference of features, averaged over the *support* of the pixel: the pixels around that look like it. What is occluded on
-one side is mostly seen from the other: the better half of the arms decides.
+difference of features, averaged over the *support* of the pixel: the pixels around that look like it. What is occluded
+on one side is mostly seen from the other: the better half of the arms decides.
 
 The aggregation is that of Hirschmüller (semi-global matching, 2008): along straight paths the least sum of costs, and
 of penalties ``p1`` between neighbouring labels and ``p2`` between any others; lower where the image has an edge.
@@ -76,7 +76,7 @@ def _formulas(spec: KernelSpec):
         tiles_x: ti.i32, slots: ti.i32, scale: real, count: ti.template(), near: ti.template(), guide: ti.template(),
         mask: ti.template(), arm_cost: ti.template(), place: ti.template(), weight: ti.template(), cost: ti.template(),
     ):  # fmt: skip
-        """Costs of the labels over the pixel's support, mean over the better half of the arms; 0 where ``mask`` is 0."""
+        """Costs of the labels over the support, mean over the better half of the arms; 0 where ``mask`` is 0."""
         y = pixel // cols
         x = pixel - y * cols
         row, col = y // tile, x // tile

@@ -26,9 +26,10 @@ class Costs:
     """How labels are rated.
 
     ``radius`` [px] of the windows in which gradients are normalised; ``most`` largest difference that counts, in units
-    of the normalised gradient; ``small`` and ``large`` penalties between neighbouring and between other labels, halved
-    where neighbouring grey values differ by ``edge`` times what is typical; ``support`` [px] radius of a pixel's support,
-    in which weights fall by e where grey values differ by ``alike`` times what is typical.
+    of the normalised gradient; ``small`` penalty between neighbouring labels; ``large`` between other labels, halved
+    where neighbouring grey values differ by ``edge`` times what is typical; ``support`` [px] radius of a pixel's
+    support, in which weights fall by e where grey values differ by ``alike`` times what is typical. A pixel is
+    explained by a cost below ``likely``.
     """
 
     radius: int = 12
@@ -38,6 +39,7 @@ class Costs:
     support: int = 2
     alike: float = 3.0
     edge: float = 1.0
+    likely: float = 0.44
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +151,7 @@ def features(image: Image, radius: int, floor: float) -> Image:
     on slow changes of the light. ``floor`` [grey]: standard deviation of the noise; where the gradient is no more than
     that of noise, features fade to 0.
     """
-    along_y, along_x = np.gradient(image.astype(np.float64))
+    along_y, along_x = (np.asarray(g) for g in np.gradient(image.astype(np.float64)))
     energy = box_mean(along_x**2 + along_y**2, radius) / 2.0
     scale = 1.0 / np.sqrt(energy + floor**2 / 2.0)  # central differences halve the variance of noise
     return np.stack([along_x * scale, along_y * scale]).astype(np.float32)
@@ -191,8 +193,8 @@ def search(
     for step_y, step_x in DIRECTIONS:
         n_lines = rows if step_y == 0 else cols if step_x == 0 else most_lines
         paths_kernel(spec)(
-            n_lines, rows, cols, step_y, step_x, labels.tile, labels.tiles_x, slots, costs.small, costs.large, costs.edge,
-            device.tasks(n_lines), tables[0], near, greys, cost, behind, total,
+            n_lines, rows, cols, step_y, step_x, labels.tile, labels.tiles_x, slots, costs.small, costs.large,
+            costs.edge, device.tasks(n_lines), tables[0], near, greys, cost, behind, total,
         )  # fmt: skip
     chosen, found, price = device.empty(size, "int"), device.empty(2 * size), device.empty(size)
     winners_kernel(spec)(

@@ -15,7 +15,7 @@ import numpy as np
 from leafflow_ti.errors import UsageError
 from leafflow_ti.synthetic.geometry import Array
 from leafflow_ti.synthetic.moving_patch import Views, directions, pulled_back, true_state, window
-from leafflow_ti.synthetic.scene import Scene, render_image, truth
+from leafflow_ti.synthetic.scene import SingleScene, render_image, truth
 
 GRADIENT_STEP = 1e-3
 """Half the distance [px] of the two images whose difference is the texture's gradient."""
@@ -25,7 +25,7 @@ SINGULAR = 1e-12
 
 
 def cramer_rao(
-    scene: Scene, x: int, y: int, size: int, *, motion: int = 9, modes: int = 0, terms: int = 0,
+    scene: SingleScene, x: int, y: int, size: int, *, motion: int = 9, modes: int = 0, terms: int = 0,
     sigma: float | None = None,
 ) -> Array:  # fmt: skip
     """Least covariance [n, n] of the state at pixel (x, y) from windows of ``size`` px, for noise of 1 grey value.
@@ -75,7 +75,7 @@ def eliminate(values: Array, texture: Array, light: Array, weights: Array, gain:
     return np.asarray(values - np.einsum("sp,kpn->ksn", lit, shares))
 
 
-def _texture(scene: Scene, x: int, y: int, size: int) -> tuple[Array, Array]:
+def _texture(scene: SingleScene, x: int, y: int, size: int) -> tuple[Array, Array]:
     """Grey values [S] of the reference image's window, free of noise, and their gradient [S, 2] per px."""
     reach = size // 2
     px, py = scene.principal

@@ -10,7 +10,9 @@ from leafflow_ti.synthetic.geometry import Array
 from leafflow_ti.synthetic.leaves import LeavesScene
 from leafflow_ti.synthetic.plane import PlaneScene
 
-Scene = PlaneScene | CubeScene | LeavesScene
+SingleScene = PlaneScene | CubeScene
+"""One object, which stays where it is when another part of its image is looked at."""
+Scene = SingleScene | LeavesScene
 
 _MODULES: dict[type, ModuleType] = {PlaneScene: plane, CubeScene: cube, LeavesScene: leaves}
 
