@@ -23,7 +23,7 @@ from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
 from leafflow_ti.reading import Box, Reader
 from leafflow_ti.refine_plan import Effort
-from leafflow_ti.refinement import PARAMETERS, Place, refine_maps, refine_middle
+from leafflow_ti.refinement import Place, refine_maps, refine_middle, starting
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.estimate import View
 from leafflow_ti.stages.prefilter import Prefilter
@@ -69,7 +69,8 @@ class Pipeline:
         self._rows = self._measurable("y", self._y, capture.height, 1)
         self._cols = self._measurable("x", self._x, capture.width, 0)
         # What a map's user is told depends on the standard errors of others, so all are there.
-        wanted = with_std(n for n in (*plan.quantities, *(PARAMETERS if plan.refine else ())) if n != "growth_rate")
+        started = starting(plan.refine) if plan.refine else ()
+        wanted = with_std(n for n in (*plan.quantities, *started) if n != "growth_rate")
         self._names = tuple(dict.fromkeys((*wanted, *(INPUTS if plan.differences else ()))))
         self.effort = Effort()
         """Of the refinement in all units so far."""

@@ -85,7 +85,7 @@ def test_stripes_along_the_cameras_determine_no_depth(model: str) -> None:
 def test_texture_in_all_directions_identifies_every_group(model: str) -> None:
     field = Moving(checks).measure(model)
     grid = ["depth", "normals", "translation", "rotation"] if not model.startswith("flow") else []
-    wanted = ["flow", *grid]
+    wanted = ["flow", *(["flow_gradient"] if model == "flow-affine" else []), *grid]
     assert {group for group in IDENTIFIED if share(field, group) == 1} == set(wanted)
     assert {group for group in IDENTIFIED if share(field, group) > 0} == set(wanted)
 
