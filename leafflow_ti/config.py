@@ -28,6 +28,7 @@ from leafflow_ti.config_sections import (
 )
 from leafflow_ti.config_values import numbers
 from leafflow_ti.errors import ConfigError
+from leafflow_ti.models import MODELS
 from leafflow_ti.presets import (
     PRESETS,
     REFINED_MODEL,
@@ -152,7 +153,8 @@ def resolve(config: RunConfig, n_frames: int, n_rows: int, n_cols: int) -> RunCo
 
     steps = decided(refine.steps, preset.steps if name == REFINED_MODEL else 0)
     size = decided(refine.window, max(window.size, REFINED_WINDOW))
-    thin = max(1, size // REFINED_SAMPLES)
+    # One camera has few images of a window: what thinning would save is little, and what it would lose is noise.
+    thin = 1 if MODELS[name].cameras == "reference" else max(1, size // REFINED_SAMPLES)
     thin = min(thin, preset.thin or thin)
     sections = {
         "model": {"name": name},

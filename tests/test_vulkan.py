@@ -19,6 +19,7 @@ import pytest
 import test_estimators
 import test_kernels_tensor
 import test_range_flow
+import test_refine
 from reference import chain, patch
 from refine_bench import SCENE, Case, covariance, estimated
 from test_kernels_estimate import assert_maps_equal
@@ -34,6 +35,7 @@ PIXELS = ((0, 0), (1, 3), (2, 4))
 SYSTEMS = [
     ("depth", "none", "line-x", None),
     ("depth", "camera", "square", None),
+    ("flow-affine", "none", "single", None),
     ("affine-4d", "none", "line-x", "rotation"),
     ("affine-scene-flow", "temporal", "line-x", "acceleration"),
 ]
@@ -60,7 +62,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 7} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 8} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -158,3 +160,12 @@ def on_vulkan_the_refinement_equals_the_twin(device: Callable) -> None:
     assert holed[0].converged.all()
     np.testing.assert_array_equal(holed[0].parameters, holed[1].parameters)
     assert (holed[0].parameters != found.parameters).any()
+
+
+def on_vulkan_a_flat_patch_equals_the_twin(device: Callable) -> None:
+    case = test_refine.CASES["flat, uneven times"]
+    found, wanted = case.refine(device("f32")), case.twin()
+    assert found.converged.all()
+    errors = np.sqrt(np.diag(wanted.covariance))
+    assert np.abs(estimated(found.parameters[0] - wanted.state, case) / errors).max() < 0.05
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance(found, case))) / errors, 0.997, atol=0.015)
