@@ -152,8 +152,8 @@ class RefineSection(Section):
     """Exact refinement: at most ``steps`` Gauss-Newton steps (0: none) on every ``thin``-th pixel of a ``window``.
 
     "auto": ``steps`` as the preset has them for affine-scene-flow, else 0; ``window``: that of the model; ``thin``:
-    some 21 samples across the window, or more where the preset says so, and all of them for one camera; ``spline``:
-    the degree of the interpolation, 7 with precision f64.
+    some 21 samples across the window, or more where the preset says so, and every second one for one camera;
+    ``spline``: the degree of the interpolation, 7 with precision f64.
     """
 
     steps: _AutoSteps = "auto"

@@ -150,6 +150,13 @@ def test_one_camera_sees_a_flat_patch(
     assert f"{len(estimated)} unknowns (flow" in planned.describe()
 
 
+def test_the_window_of_one_camera_is_thinned_little() -> None:
+    thins = [refined(model="flow-affine", refine=3, window=w).thin for w in (33, 65, 85)]
+    assert thins == [1, 2, 2]
+    assert refined(model="flow-affine", refine=3, window=65, thin=4).thin == 4
+    assert refined(model="affine-4d", refine=3, window=65).thin == 3
+
+
 def test_refining_the_flow_must_be_asked_for() -> None:
     for preset in ("fast", "balanced", "accurate"):
         assert plan(capture(cols=1), preset=preset).refine is None
