@@ -61,7 +61,8 @@ class ModelSection(Section):
     ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its derivatives along x, y) followed by
     any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can. ``deformation`` growth:
     the patch may grow in its plane, one more unknown; auto: where the flows of all cameras, or the refinement, are
-    there to tell. strain: in the refinement it may stretch in its plane, three more unknowns.
+    there to tell. strain: in the refinement it may stretch in its plane, three more unknowns; for one camera that is
+    what auto means.
 
     ``scale`` of the coordinates in a window, for estimators that depend on it: tls, sampson, fns. ``penalty`` on the
     residuals of the robust estimators, which estimate anew where the plain fit ``failed``, or ``all`` pixels.

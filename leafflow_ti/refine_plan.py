@@ -21,8 +21,10 @@ PIXEL_VARIANCE = 1 / 12
 _TERMS = {"none": 0, "temporal": 1, "spatial": 3, "camera": 6}
 """Brightness model -> photometric terms of an image: gain; its slopes; its curvatures."""
 _RIGID = 3 + len(MOTION_NAMES)
+"""Parameters of a patch that does not deform: Z0, ZX, ZY, N, Ω, A; behind them stand growth rates."""
 _IN_PLANE = (3, 4, 8, 9, 10)
 """Parameters that move a plane within itself where it faces the camera: N_X, N_Y, Ω_Z, A_X, A_Y."""
+_FLAT_NAMES = ("flow_x", "flow_y", *FLOW_GRADIENT_NAMES, *PLANE_STRAIN_NAMES)
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,8 @@ class Refinement:
     alike in all directions), 3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6. ``degree``
     of the splines, 5 or 7.
 
-    ``flat``: one camera sees a plane that faces it and moves within itself. Its depth is 1, its slopes are 0, and so is
-    what is left of the motion; with a focal length of 1 its lengths are pixels of the image.
+    ``flat``: one camera sees a plane that faces it and moves within itself. Depth and focal length are 1, so that its
+    lengths are pixels of the image; slopes, and what would lead out of the plane, are 0.
     """
 
     steps: int
@@ -102,10 +104,10 @@ class Refinement:
         """Maps that a model may measure, and that are 0 by what the refinement takes as given."""
         if not self.flat:
             return frozenset() if self.modes else frozenset({"growth_rate"})
-        names = {
-            0: {"flow_xx", "flow_yy", *PLANE_STRAIN_NAMES}, 1: {"strain_xy"}, 3: set[str]()
-        }[self.modes]  # fmt: skip
-        return frozenset(names if self.turns or self.modes == 3 else names | {"flow_xy", "flow_yx"})
+        if self.modes == 3:
+            return frozenset()
+        stiff = ("strain_xy",) if self.modes else ("flow_xx", "flow_yy", *PLANE_STRAIN_NAMES)
+        return frozenset(stiff if self.turns else (*stiff, "flow_xy", "flow_yx"))
 
     def describe(self) -> str:
         """One line of the plan."""
@@ -119,9 +121,6 @@ class Refinement:
             f"unknowns ({rigid}, {modes}), {self.terms} photometric terms an image, "
             f"splines of degree {self.degree}"
         )
-
-
-_FLAT_NAMES = ("flow_x", "flow_y", *FLOW_GRADIENT_NAMES, *PLANE_STRAIN_NAMES)
 
 
 @dataclass(frozen=True)
@@ -168,8 +167,8 @@ def plan_refinement(
     if not steps:
         if flat and model.deformation != "auto":
             raise ConfigError(
-                f"deformation '{model.deformation}': model '{model.name}' takes it as it comes, the refinement alone "
-                "can choose: give --refine 3, or leave deformation out"
+                f"deformation '{model.deformation}': of model '{model.name}' only the refinement has a choice: give "
+                "--refine 3, or leave deformation out"
             )
         if model.deformation == "strain":
             raise ConfigError(

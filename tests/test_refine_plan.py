@@ -177,9 +177,9 @@ def test_times_need_not_be_whole() -> None:
     ("of", "options", "message"),
     [
         ({}, {"model": "flow-affine", "motion": "rotation"}, "model 'flow-affine' does not have it"),
-        ({}, {"model": "flow-affine", "deformation": "none"}, "the refinement alone can choose: give --refine 3"),
-        ({}, {"model": "flow", "deformation": "growth"}, "the refinement alone can choose: give --refine 3"),
-        ({}, {"model": "flow-quadratic", "deformation": "strain"}, "the refinement alone can choose: give --refine 3"),
+        ({}, {"model": "flow-affine", "deformation": "none"}, "only the refinement has a choice: give --refine 3"),
+        ({}, {"model": "flow", "deformation": "growth"}, "only the refinement has a choice: give --refine 3"),
+        ({}, {"model": "flow-quadratic", "deformation": "strain"}, "only the refinement has a choice: give --refine 3"),
         ({}, {"deformation": "strain", "refine": 0}, "'strain' is measured by the refinement alone: give --refine 3"),
         ({}, {"deformation": "strain", "preset": "fast"}, "'strain' is measured by the refinement alone"),
         ({}, {"deformation": "growth", "refine": 0, "model": "affine-4d"}, "choose affine-scene-flow, or a refinement"),
