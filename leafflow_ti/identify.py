@@ -54,8 +54,8 @@ class Limits:
             return distance / (self.radius_px if axis == "z" else self.f_px)
         if name in FLOW_GRADIENT_NAMES:
             return 1 / self.radius_px
-        if name in PLANE_STRAIN_NAMES:
-            return 100 / self.radius_px
+        if name in PLANE_STRAIN_NAMES:  # the shear is half a sum of derivatives: not known better than either
+            return (50 if name == "strain_xy" else 100) / self.radius_px
         if name in ("brightness_world_x", "brightness_world_y"):
             return self.f_px / (self.radius_px * distance)
         if stem == "rotation":
