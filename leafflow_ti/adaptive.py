@@ -21,7 +21,7 @@ from leafflow_ti.field import empty_map
 from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.reading import Mask
-from leafflow_ti.refinement import Place, refine_beyond, refine_maps, ring
+from leafflow_ti.refinement import Place, refine_beyond, refine_maps, refined_from, ring
 from leafflow_ti.search import Extent, coarse_search
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.status import HAS_VALUE, Status
@@ -179,6 +179,8 @@ class Adaptive:
         self, tiles: list[_Tile], surfaces: Surfaces, frame: int, maps: Maps, codes: Codes, chosen: NDArray[np.int64]
     ) -> None:
         """Refine a band's pixels, then those that no pass had values for, from tile to tile as far as they lead."""
+        refine = self.plan.refine
+        assert refine is not None
         for tile in tiles:
             for group in tile.groups(surfaces):
                 mine = np.isin(chosen[tile.place], group)
@@ -195,7 +197,7 @@ class Adaptive:
                 for group in tile.groups(surfaces):
                     wanted = np.isin(number, group) & missing[tile.place]
                     joined = _joined(surfaces.shown[np.ix_(range(4), tile.y, tile.x)])
-                    known = (codes[tile.place] == Status.OK) & np.isfinite(maps["depth"][tile.place])
+                    known = refined_from(refine, {n: m[tile.place] for n, m in maps.items()}, codes[tile.place])
                     if ring(wanted, known, joined)[0].size:
                         self._refine_group(tile, surfaces, group, frame, maps, codes, wanted, True)
                         missing[tile.place] &= ~(wanted & np.isin(codes[tile.place], HAS_VALUE))

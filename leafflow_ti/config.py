@@ -29,7 +29,9 @@ from leafflow_ti.config_sections import (
 )
 from leafflow_ti.config_values import numbers
 from leafflow_ti.errors import ConfigError
+from leafflow_ti.models import MODELS
 from leafflow_ti.presets import (
+    MOST_THINNED_ALONE,
     PRESETS,
     REFINED_MODEL,
     REFINED_SAMPLES,
@@ -161,6 +163,8 @@ def resolve(config: RunConfig, n_frames: int, n_rows: int, n_cols: int) -> RunCo
     steps = decided(refine.steps, preset.steps if name == REFINED_MODEL else 0)
     size = decided(refine.window, max(window.size, REFINED_WINDOW))
     thin = max(1, size // REFINED_SAMPLES)
+    if MODELS[name].cameras == "reference":
+        thin = min(thin, MOST_THINNED_ALONE)
     thin = min(thin, preset.thin or thin)
     sections = {
         "model": {"name": name},

@@ -72,7 +72,8 @@ class ModelSection(Section):
     ``rows`` of the 3D fit: ``auto``, or ``u`` (the flow alone) or ``2d`` (with its derivatives along x, y) followed by
     any of ``+b5+as+at``. ``motion`` auto: rotation, where the model can. ``deformation`` growth:
     the patch may grow in its plane, one more unknown; auto: where the flows of all cameras, or the refinement, are
-    there to tell. strain: in the refinement it may stretch in its plane, three more unknowns.
+    there to tell. strain: in the refinement it may stretch in its plane, three more unknowns; for one camera that is
+    what auto means.
 
     ``scale`` of the coordinates in a window, for estimators that depend on it: tls, sampson, fns. ``penalty`` on the
     residuals of the robust estimators, which estimate anew where the plain fit ``failed``, or ``all`` pixels.
@@ -172,8 +173,8 @@ class RefineSection(Section):
     """Exact refinement: at most ``steps`` Gauss-Newton steps (0: none) on every ``thin``-th pixel of a ``window``.
 
     "auto": ``steps`` as the preset has them for affine-scene-flow, else 0; ``window``: that of the model; ``thin``:
-    some 21 samples across the window, or more where the preset says so; ``spline``: the degree of the interpolation, 7
-    with precision f64.
+    some 21 samples across the window, or more where the preset says so, and every second one for one camera;
+    ``spline``: the degree of the interpolation, 7 with precision f64.
     """
 
     steps: _AutoSteps = "auto"

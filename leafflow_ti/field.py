@@ -35,6 +35,13 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "acceleration_z": ("mm/frame²", "surface acceleration along Z"),
     "flow_x": ("px/frame", "optical flow along x"),
     "flow_y": ("px/frame", "optical flow along y"),
+    "flow_xx": ("1/frame", "derivative along x of the optical flow along x"),
+    "flow_xy": ("1/frame", "derivative along y of the optical flow along x"),
+    "flow_yx": ("1/frame", "derivative along x of the optical flow along y"),
+    "flow_yy": ("1/frame", "derivative along y of the optical flow along y"),
+    "strain_xx": ("%/frame", "strain rate in the image plane along x"),
+    "strain_yy": ("%/frame", "strain rate in the image plane along y"),
+    "strain_xy": ("%/frame", "shear strain rate in the image plane, half the angle between x and y"),
     "normal_flow_x": ("px/frame", "x component of the optical flow along the gradient"),
     "normal_flow_y": ("px/frame", "y component of the optical flow along the gradient"),
     "brightness_t": ("1/frame", "relative brightness change per frame"),
@@ -60,7 +67,9 @@ QUANTITIES: dict[str, tuple[str, str]] = {
 WITHOUT_STD = ("confidence", "support", "identified")
 IDENTIFIED: dict[str, int] = {
     name: 1 << bit
-    for bit, name in enumerate(("depth", "normals", "translation", "rotation", "acceleration", "brightness", "flow"))
+    for bit, name in enumerate(
+        ("depth", "normals", "translation", "rotation", "acceleration", "brightness", "flow", "flow_gradient")
+    )
 }
 """Group of parameters -> its bit in the map ``identified`` (uint8)."""
 
@@ -68,6 +77,10 @@ MOTION_NAMES = tuple(f"{q}_{a}" for q in ("velocity", "rotation", "acceleration"
 """Maps of the unknowns (N, Ω, A)."""
 STRAIN_NAMES = ("strain_rate_11", "strain_rate_22", "strain_rate_12")
 """Maps of the strain rates in the surface, which add up to the growth rate: 11 + 22."""
+FLOW_GRADIENT_NAMES = ("flow_xx", "flow_xy", "flow_yx", "flow_yy")
+"""Maps of the flow's derivatives in one camera, component by component."""
+PLANE_STRAIN_NAMES = ("strain_xx", "strain_yy", "strain_xy")
+"""Maps of their symmetric part: how a flat specimen that faces the camera is strained; 1 % is 10,000 µε."""
 
 
 def quantity(name: str) -> tuple[str, str]:

@@ -16,21 +16,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.field import IDENTIFIED
+from leafflow_ti.field import FLOW_GRADIENT_NAMES, IDENTIFIED, MOTION_NAMES, PLANE_STRAIN_NAMES, QUANTITIES
 from leafflow_ti.status import HAS_VALUE, Status
 
 Array = NDArray[Any]
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "depth": ("disparity", "depth"),
-    "normals": ("slope_",),
-    "translation": ("velocity_",),
-    "rotation": ("rotation_",),
-    "acceleration": ("acceleration_",),
-    "brightness": ("brightness_",),
-    "flow": ("flow_",),
+    "normals": ("slope_x", "slope_y"),
+    "translation": MOTION_NAMES[:3],
+    "rotation": MOTION_NAMES[3:6],
+    "acceleration": MOTION_NAMES[6:],
+    "brightness": tuple(name for name in QUANTITIES if name.startswith("brightness_")),
+    "flow": ("flow_x", "flow_y"),
+    "flow_gradient": (*FLOW_GRADIENT_NAMES, *PLANE_STRAIN_NAMES),
 }
-"""Group -> how the names of its maps begin."""
+"""Group -> its maps."""
 _NORMAL_FLOW = ("normal_flow_x", "normal_flow_y")
 
 
@@ -51,6 +52,10 @@ class Limits:
             return np.minimum(distance / 2, distance**2 / self.lever) if self.lever else distance / 2
         if stem in ("velocity", "acceleration"):
             return distance / (self.radius_px if axis == "z" else self.f_px)
+        if name in FLOW_GRADIENT_NAMES:
+            return 1 / self.radius_px
+        if name in PLANE_STRAIN_NAMES:  # the shear is half a sum of derivatives: not known better than either
+            return (50 if name == "strain_xy" else 100) / self.radius_px
         if name in ("brightness_world_x", "brightness_world_y"):
             with np.errstate(divide="ignore"):  # no depth yet: no limit
                 return self.f_px / (self.radius_px * distance)
@@ -69,8 +74,8 @@ def settle(maps: MutableMapping[str, Array], status: NDArray[np.uint8], limits: 
     measured = np.isin(status, HAS_VALUE)
     identified = np.zeros(measured.shape, np.uint8)
     depth: Array | float = np.array(maps["depth"], np.float32) if "depth" in maps else 1.0
-    for group, begins in GROUPS.items():
-        names = [name for name in maps if name.startswith(begins) and not name.endswith("_std")]
+    for group, members in GROUPS.items():
+        names = [name for name in members if name in maps]
         if not names:
             continue
         whole = measured.copy()

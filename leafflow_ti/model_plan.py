@@ -9,7 +9,7 @@ from leafflow_ti.capture import Capture
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import choose_filter_set, filter_set
-from leafflow_ti.models import MODELS, OWN_FLOW, Model, column_set, parse_rows
+from leafflow_ti.models import MODELS, OWN_FLOW, Model, column_set, flow_offsets, parse_rows
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.problem import OwnFlows, Problem, unknowns_of
 
@@ -38,7 +38,7 @@ def model_problem(capture: Capture, config: RunConfig, name: str, motion: str | 
     columns = column_set(
         model, config.model.brightness, sampling.camera_axes, sampling.sampled, config.model.brightness_terms
     )
-    offsets: tuple[str, ...] = ("1",)
+    offsets = flow_offsets(columns)
     use_range, fitted, own = False, 0, None
     if motion:
         rows = config.model.rows if model.reference_rows else "2d"
@@ -69,6 +69,8 @@ def weighing(config: RunConfig) -> dict[str, Any]:
 def fitted_motion(config: RunConfig, name: str) -> str | None:
     """The motion that is fitted; None for a model without a 3D fit."""
     wanted, motions = config.model.motion, MODELS[name].motions
+    if MODELS[name].cameras == "reference" and config.refine.steps:
+        return None  # the choice is the refinement's
     if wanted != "auto" and wanted not in motions:
         can = f"it measures {', '.join(motions)}" if motions else "it measures no 3D motion"
         raise ConfigError(

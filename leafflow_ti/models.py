@@ -292,6 +292,11 @@ def column_set(
     return ColumnSet(tuple(columns), len(time_like))
 
 
+def flow_offsets(columns: ColumnSet) -> tuple[str, ...]:
+    """What a model without a 3D fit measures of the flow: itself (offset "1"), and its derivatives along x and y."""
+    return ("1", *(o for o in ("x", "y") if "t" in columns.solutions and columns.index("x", o) is not None))
+
+
 def parse_rows(rows: str, model: str, motion: str, columns: ColumnSet) -> tuple[tuple[str, ...], bool]:
     """Which motion offsets enter the 3D fit, and whether the range constraint (b5) does.
 

@@ -21,7 +21,7 @@ from leafflow_ti.capture import (
 )
 from leafflow_ti.config import RunConfig, resolve
 from leafflow_ti.errors import ConfigError
-from leafflow_ti.field import MOTION_NAMES, QUANTITIES, with_std
+from leafflow_ti.field import FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, QUANTITIES, with_std
 from leafflow_ti.identify import Limits
 from leafflow_ti.model_plan import cameras_read, check_model, fitted_motion, model_problem, sampling_of, static
 from leafflow_ti.models import MODELS, TensorLayout
@@ -111,8 +111,8 @@ class Plan:
         """Names of the maps: those that the model measures, and those that the refinement adds."""
         if self.refine is None:
             return self.measured
-        names = {*self.measured, *self.refine.names}
-        return tuple(n for n in QUANTITIES if n in names and (self.refine.modes or n != "growth_rate"))
+        names = {*self.measured, *self.refine.names} - self.refine.excluded
+        return tuple(n for n in QUANTITIES if n in names)
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -127,6 +127,8 @@ class Plan:
         names += MOTION_NAMES[: problem.unknowns]
         if "t" in problem.columns.solutions and not self.ranges:
             names += ["flow_x", "flow_y", "normal_flow_x", "normal_flow_y"]
+            if not problem.unknowns and len(problem.offsets) > 1:
+                names += [*FLOW_GRADIENT_NAMES, *PLANE_STRAIN_NAMES]
         if problem.columns.index("i") is not None:
             names += [f"brightness_{a}" for a in problem.camera_axes]
         names += [BRIGHTNESS_MAPS[o] for o in problem.brightness]
@@ -254,7 +256,8 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
             f"brightness '{config.model.brightness}' is relative to the grey value, which prefilter 'highpass' takes "
             "away: choose prefilter homomorphic, or brightness none"
         )
-    if config.model.deformation == "growth" and not model.own_flows and not config.refine.steps:
+    flat = model.cameras == "reference"
+    if config.model.deformation == "growth" and not (flat or model.own_flows or config.refine.steps):
         raise ConfigError(
             f"deformation 'growth': model '{name}' cannot tell it from approach: choose affine-scene-flow, or a "
             "refinement (--refine 3)"

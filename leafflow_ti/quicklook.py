@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.errors import MissingExtra, RunError
-from leafflow_ti.field import STRAIN_NAMES, Field, quantity
+from leafflow_ti.field import PLANE_STRAIN_NAMES, STRAIN_NAMES, Field, quantity
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 
@@ -120,6 +120,10 @@ def _pages(field: Field) -> dict[str, list[_Panel]]:
         pages[page] = panels
         if base != "rotation" and f"{base}_x" in field and f"{base}_y" in field:
             pages[page] = [*panels, partial(_draw_arrows, field, base)]
+    strain = _maps(field, PLANE_STRAIN_NAMES)
+    if strain:
+        pages["strain"] = strain
+        overview += strain
     if "growth_rate" in field:
         pages["growth"] = _maps(field, ["growth_rate", "growth_rate_std", *STRAIN_NAMES])
         overview += pages["growth"][:1]

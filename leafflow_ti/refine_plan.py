@@ -5,12 +5,14 @@ A pure value; stages and kernels read it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError
-from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
+from leafflow_ti.field import FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, STRAIN_NAMES
+from leafflow_ti.models import MODELS
 from leafflow_ti.presets import REFINED_WINDOW
 from leafflow_ti.splines import filter_radius, support
 
@@ -18,6 +20,11 @@ PIXEL_VARIANCE = 1 / 12
 """Variance of a pixel's area [px²], over which the sensor has averaged already."""
 _TERMS = {"none": 0, "temporal": 1, "spatial": 3, "camera": 6}
 """Brightness model -> photometric terms of an image: gain; its slopes; its curvatures."""
+_RIGID = 3 + len(MOTION_NAMES)
+"""Parameters of a patch that does not deform: Z0, ZX, ZY, N, Ω, A; behind them stand growth rates."""
+_IN_PLANE = (3, 4, 8, 9, 10)
+"""Parameters that move a plane within itself where it faces the camera: N_X, N_Y, Ω_Z, A_X, A_Y."""
+_FLAT_NAMES = ("flow_x", "flow_y", *FLOW_GRADIENT_NAMES, *PLANE_STRAIN_NAMES)
 
 
 @dataclass(frozen=True)
@@ -25,28 +32,43 @@ class Refinement:
     """At most ``steps`` Gauss-Newton steps on the exact moving patch.
 
     ``size``, ``sigma``: Gaussian window [px], of which every ``thin``-th pixel around the centre is a sample.
-    ``frames``: offsets from the reference frame; ``cameras``: (x, y) steps from the reference camera, in the order of
-    a block's images (rows, then columns). Unknowns are depth and slopes (Z0, ZX, ZY); ``motion``: how many of
-    (N, Ω, A): 0, 3, 6 or 9; ``modes`` of the deformation in the patch's plane: 0, 1 (growth alike in all directions),
-    3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6. ``degree``
+    ``frames``: times from the reference frame, in frames, of any spacing; ``cameras``: (x, y) steps from the reference
+    camera, in the order of a block's images (rows, then columns). Unknowns are depth and slopes (Z0, ZX, ZY);
+    ``motion``: how many of (N, Ω, A): 0, 3, 6 or 9; ``modes`` of the deformation in the patch's plane: 0, 1 (growth
+    alike in all directions), 3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6. ``degree``
     of the splines, 5 or 7.
+
+    ``flat``: one camera sees a plane that faces it and moves within itself. Depth and focal length are 1, so that its
+    lengths are pixels of the image; slopes, and what would lead out of the plane, are 0.
     """
 
     steps: int
     size: int
     sigma: float
     thin: int
-    frames: tuple[int, ...]
+    frames: tuple[float, ...]
     cameras: tuple[tuple[int, int], ...]
     motion: int
     modes: int
     terms: int
     degree: int = 5
+    flat: bool = False
+
+    @property
+    def estimated(self) -> tuple[int, ...]:
+        """Which of the parameters (Z0, ZX, ZY, N, Ω, A, growth rates) are unknown."""
+        rigid = [i for i in range(3 + self.motion) if not self.flat or i in _IN_PLANE]
+        return (*rigid, *range(_RIGID, _RIGID + self.modes))
 
     @property
     def unknowns(self) -> int:
         """Unknowns of a pixel, photometric terms and texture left out."""
-        return 3 + self.motion + self.modes
+        return len(self.estimated)
+
+    @property
+    def turns(self) -> bool:
+        """Whether the rotation is among the unknowns."""
+        return self.motion > 3
 
     @property
     def across(self) -> int:
@@ -57,7 +79,7 @@ class Refinement:
     def reach(self) -> int:
         """Pixels that a sample may lie from its place in the preshifted window."""
         steps = max(max(abs(x), abs(y)) for x, y in self.cameras)
-        return steps + 2 * max(abs(t) for t in self.frames) + 4
+        return steps + math.ceil(2 * max(abs(t) for t in self.frames)) + 4
 
     @property
     def halo(self) -> int:
@@ -71,17 +93,32 @@ class Refinement:
     @property
     def names(self) -> tuple[str, ...]:
         """Maps that are measured, in the order of the unknowns; strain rates stand behind the growth they make up."""
+        if self.flat:
+            return tuple(n for n in _FLAT_NAMES if n not in self.excluded)
         growth = ("growth_rate",) if self.modes else ()
         strain = STRAIN_NAMES if self.modes == 3 else ()
         return ("depth", "slope_x", "slope_y", *MOTION_NAMES[: self.motion], *growth, *strain)
 
+    @property
+    def excluded(self) -> frozenset[str]:
+        """Maps that a model may measure, and that are 0 by what the refinement takes as given."""
+        if not self.flat:
+            return frozenset() if self.modes else frozenset({"growth_rate"})
+        if self.modes == 3:
+            return frozenset()
+        stiff = ("strain_xy",) if self.modes else ("flow_xx", "flow_yy", *PLANE_STRAIN_NAMES)
+        return frozenset(stiff if self.turns else (*stiff, "flow_xy", "flow_yx"))
+
     def describe(self) -> str:
         """One line of the plan."""
         modes = {0: "no deformation", 1: "growth", 3: "strain"}[self.modes]
+        rigid = f"depth, slopes, {self.motion} of motion"
+        if self.flat:
+            rigid = "flow, rotation, acceleration" if self.turns else "flow"
         return (
             f"refinement  at most {self.steps} steps, window of {self.size} px thinned by {self.thin} "
             f"({self.across**2} samples), {len(self.frames)} frames of {len(self.cameras)} cameras; {self.unknowns} "
-            f"unknowns (depth, slopes, {self.motion} of motion, {modes}), {self.terms} photometric terms an image, "
+            f"unknowns ({rigid}, {modes}), {self.terms} photometric terms an image, "
             f"splines of degree {self.degree}"
         )
 
@@ -126,16 +163,22 @@ def plan_refinement(
     """
     model, window, cameras = config.model, config.window, tuple(cameras)
     steps, size, thin = (int(value) for value in (config.refine.steps, config.refine.window, config.refine.thin))
+    flat = MODELS[model.name].cameras == "reference"
     if not steps:
+        if flat and model.deformation != "auto":
+            raise ConfigError(
+                f"deformation '{model.deformation}': of model '{model.name}' only the refinement has a choice: give "
+                "--refine 3, or leave deformation out"
+            )
         if model.deformation == "strain":
             raise ConfigError(
                 "deformation 'strain' is measured by the refinement alone: give --refine 3, or choose growth"
             )
         return None
-    if len(cameras) == 1:
+    if len(cameras) == 1 and not flat:
         raise ConfigError(
             f"refine.steps = {steps}: model '{model.name}' reads one camera, and depth is refined from several: choose "
-            "a model of a camera grid, or --refine 0"
+            "a model of a camera grid, flow-affine for motion in the image, or --refine 0"
         )
     if temporal is None and model.deformation in ("growth", "strain"):
         raise ConfigError(
@@ -157,9 +200,11 @@ def plan_refinement(
     if temporal is not None:
         # A point that turns accelerates by ω²R: without A among the unknowns it is the velocity that errs.
         motion = 3 if model.motion == "translation" else 9
-        modes = {"none": 0, "strain": 3}.get(model.deformation, 1)
+        modes = {"none": 0, "growth": 1, "strain": 3}.get(model.deformation, 3 if flat else 1)
     curved = model.brightness != "none" and model.brightness_terms in ("space", "both")
     terms = 6 if curved else _TERMS[model.brightness]
     sigma = window.sigma * size / window.size
     frames = tuple(temporal or (0,))
-    return Refinement(steps, size, sigma, thin, frames, cameras, motion, modes, terms, int(config.refine.spline))
+    return Refinement(
+        steps, size, sigma, thin, frames, cameras, motion, modes, terms, int(config.refine.spline), flat
+    )  # fmt: skip

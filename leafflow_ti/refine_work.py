@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from leafflow_ti.kernels.refine_tables import DERIVATIVES, MAX_UNKNOWNS, SHIFTS, Out
+from leafflow_ti.kernels.refine_tables import DERIVATIVES, GROWTH, MAX_UNKNOWNS, SHIFTS, Out
 from leafflow_ti.plan import Plan
 from leafflow_ti.refine_plan import Effort, Refinement
 from leafflow_ti.splines import filter_taps, spline_pieces
@@ -92,7 +92,7 @@ def _pass_flops(plan: Refinement) -> float:
     texture = GAIN[terms] + BLUR + 2 + TUKEY + 12
     sums = GAIN[terms] + RESIDUAL + 5 + 2 * functions
     common = 8 + max(0, terms - 1) + 3 * functions * (functions + 1) / 2  # texture; products of the functions
-    turning = max(0, min(plan.motion, 6) - 3) + plan.modes
+    turning = sum(6 <= i < 9 or i >= GROWTH for i in plan.estimated)
     image = WARP + n * MOVE + turning * TURN + _step_flops(n, terms)
     photometry = cholesky_flops(terms) + substitution_flops(terms, SHIFTS) + 2 * terms * SHIFTS**2 if terms else 0.0
     return (

@@ -6,6 +6,7 @@ a neighbour has arrived at. Pixels that it does not improve keep the values of t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.capture import Geometry
-from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
+from leafflow_ti.field import FLOW_GRADIENT_NAMES, MOTION_NAMES, STRAIN_NAMES
 from leafflow_ti.refine_plan import Effort, Refinement
 from leafflow_ti.stages.refine import Refined, RefineStage
 from leafflow_ti.status import Status
@@ -48,21 +49,19 @@ def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArra
     Texture in one direction alone (aperture) does not determine the motion, and the noise in the texture's gradient
     would pass for what does: such pixels keep what the model says. So do those where a robust estimator had to choose
     between surfaces (``support`` below 1): the refinement takes all of the window as one, and would mix them again.
-    ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at.
+    ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at. Of a
+    ``flat`` patch it is the flow that must be known, not the depth.
     """
     if "support" in maps:
         status[(status == Status.OK) & (maps["support"] < 1)] = Status.UNREFINED
-    rows, cols = np.nonzero((status == Status.OK) & np.isfinite(maps["depth"]))
+    rows, cols = np.nonzero(refined_from(plan, maps, status))
     if not rows.size:
         return Effort()
-    start = np.zeros((rows.size, _GROWTH + 3))
-    for i, name in enumerate(PARAMETERS):
-        if name in maps:
-            start[:, i] = np.nan_to_num(maps[name][rows, cols])
+    start = _starts(plan, {name: maps[name][rows, cols] for name in starting(plan) if name in maps}, rows.size)
     found = _call(stage, place, rows, cols, start)
     good, effort = found.converged, found.effort
     parameters, covariance = found.parameters, found.covariance
-    again, begin = _neighbours(rows, cols, found, place, status.shape)
+    again, begin = _neighbours(plan, rows, cols, found, place, status.shape)
     if again.size:
         second = _call(stage, place, rows[again], cols[again], begin)
         effort += second.effort
@@ -90,17 +89,15 @@ def refine_beyond(
     """
     effort, wanted = Effort(), wanted.copy()
     while True:
-        known = (status == Status.OK) & np.isfinite(maps["depth"])
+        known = refined_from(plan, maps, status)
         rows, cols, from_rows, from_cols = ring(wanted, known, joined)
         if not rows.size:
             return effort
         wanted[rows, cols] = False
-        there = np.zeros((rows.size, _GROWTH + 3))
-        for i, name in enumerate(PARAMETERS):
-            if name in maps:
-                there[:, i] = np.nan_to_num(maps[name][from_rows, from_cols])
-        f = place.geometry.f_px
-        start = transferred(there, place.rays(from_rows, from_cols) / f, place.rays(rows, cols) / f)
+        sources = {name: maps[name][from_rows, from_cols] for name in starting(plan) if name in maps}
+        rays = [place.rays(*at) / (1.0 if plan.flat else place.geometry.f_px)
+                for at in ((from_rows, from_cols), (rows, cols))]  # fmt: skip
+        start = transferred(_starts(plan, sources, rows.size), *rays)
         found = _call(stage, place, rows, cols, start)
         effort += found.effort
         good = found.converged
@@ -136,7 +133,10 @@ def _enter(
     lever: Array | None,
 ) -> None:  # fmt: skip
     """Write what pixels have been refined to into the maps. ``lever``: disparity times depth."""
-    derived = _derived(plan, parameters, covariance, place.rays(rows, cols), place.geometry.f_px)
+    if plan.flat:
+        derived = _flat_maps(plan, parameters, covariance)
+    else:
+        derived = _derived(plan, parameters, covariance, place.rays(rows, cols), place.geometry.f_px)
     if lever is not None:
         depth, std = derived["depth"]
         derived["disparity"] = lever / depth, np.abs(lever) / depth**2 * std
@@ -153,13 +153,46 @@ def refine_middle(stage: RefineStage) -> Refined:
     return stage(np.array([stage.rows // 2]), np.array([stage.cols // 2]), np.zeros((1, 2)), start)
 
 
+def refined_from(plan: Refinement, maps: Maps, status: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Pixels that hold enough to be refined from."""
+    needed = ("flow_x", "flow_y") if plan.flat else ("depth",)
+    return np.asarray((status == Status.OK) & np.all([np.isfinite(maps[name]) for name in needed], axis=0))
+
+
+def starting(plan: Refinement) -> tuple[str, ...]:
+    """Maps that the refinement starts from, as far as the model has them."""
+    if not plan.flat:
+        return PARAMETERS
+    return ("flow_x", "flow_y", *(name for name in FLOW_GRADIENT_NAMES if name not in plan.excluded))
+
+
+def _starts(plan: Refinement, maps: Maps, n: int) -> Array:
+    """Parameters [n, 15] from the values [n] of maps; 0 for what these do not hold."""
+    start = np.zeros((n, _GROWTH + 3))
+    if not plan.flat:
+        for i, name in enumerate(PARAMETERS):
+            if name in maps:
+                start[:, i] = np.nan_to_num(maps[name])
+        return start
+    xx, xy, yx, yy = (np.nan_to_num(maps.get(name, np.zeros(n))) for name in FLOW_GRADIENT_NAMES)
+    start[:, 0], start[:, 3], start[:, 4] = 1.0, maps["flow_x"], maps["flow_y"]
+    if plan.turns:
+        start[:, 8] = (yx - xy) / 2
+    rates = {0: (), 1: ((xx + yy) / 2,), 3: (xx, yy, (xy + yx) / 2)}[plan.modes]
+    for i, rate in enumerate(rates):
+        start[:, _GROWTH + i] = rate
+    return start
+
+
 def _call(stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array) -> Refined:
     y, x = np.array(place.y)[rows] - place.corner[0], np.array(place.x)[cols] - place.corner[1]
-    return stage(y, x, place.rays(rows, cols), start)
+    # A flat patch is the same anywhere in the image; from its own pixel its lengths stay small.
+    at = np.zeros((len(y), 2)) if stage.plan.flat else place.rays(rows, cols)
+    return stage(y, x, at, start)
 
 
 def _neighbours(
-    rows: Array, cols: Array, found: Refined, place: Place, shape: tuple[int, ...]
+    plan: Refinement, rows: Array, cols: Array, found: Refined, place: Place, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.intp], Array]:
     """Which pixels to try again, and their starts: from the best of the four neighbours that converged."""
     index = np.full((shape[0] + 2, shape[1] + 2), -1)
@@ -169,8 +202,8 @@ def _neighbours(
     cost = np.where(around >= 0, found.cost[around], np.inf)
     best = np.take_along_axis(around, cost.argmin(axis=1)[:, None], axis=1)[:, 0]
     failed, best = failed[best >= 0], best[best >= 0]
-    rays, f = place.rays(rows, cols), place.geometry.f_px
-    return failed, transferred(found.parameters[best], rays[best] / f, rays[failed] / f)
+    rays = place.rays(rows, cols) / (1.0 if plan.flat else place.geometry.f_px)
+    return failed, transferred(found.parameters[best], rays[best], rays[failed])
 
 
 def transferred(parameters: Array, seen: Array, wanted: Array) -> Array:
@@ -192,18 +225,47 @@ def transferred(parameters: Array, seen: Array, wanted: Array) -> Array:
     return result
 
 
-def _derived(plan: Refinement, q: Array, covariance: Array, rays: Array, f: float) -> dict[str, tuple[Array, Array]]:
-    """Maps and standard errors [n] from parameters [n, 15] and their covariance."""
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """``covariance`` [n, 15, 15] of parameters, and what follows from it."""
 
-    def linear(gradient: dict[int, Array | float]) -> Array:
-        """Standard error of a function of this gradient; infinite where one of its parameters is not determined."""
-        total, lost = np.zeros(len(q)), np.zeros(len(q), bool)
+    covariance: Array
+
+    def error(self, gradient: Mapping[int, Array | float]) -> Array:
+        """Standard error [n] of a function of this gradient; infinite where one of its parameters is not determined."""
+        n = len(self.covariance)
+        total, lost = np.zeros(n), np.zeros(n, bool)
         for i, a in gradient.items():
-            lost |= covariance[:, i, i] < 0
+            lost |= self.covariance[:, i, i] < 0
             for j, b in gradient.items():
-                total += a * b * covariance[:, i, j]
+                total += a * b * self.covariance[:, i, j]
         return np.where(lost, np.inf, np.sqrt(np.maximum(total, 0)))
 
+    def rate(self, q: Array, gradient: Mapping[int, float]) -> tuple[Array, Array]:
+        """Value and standard error [n] of a sum of parameters q [n, 15]; no value where one is not determined."""
+        std = self.error(gradient)
+        return np.where(np.isfinite(std), sum(a * q[:, i] for i, a in gradient.items()), np.nan), std
+
+
+def _flat_maps(plan: Refinement, q: Array, covariance: Array) -> dict[str, tuple[Array, Array]]:
+    """Maps and standard errors [n] of a patch that faces the camera: its velocity, its turn and strain as derivatives
+    of the flow, from parameters [n, 15]."""
+    turn = {8: 1.0} if plan.turns else {}
+    one, two, both = _GROWTH, _GROWTH + (plan.modes == 3), _GROWTH + 2
+    shear = {both: 1.0} if plan.modes == 3 else {}
+    sums: dict[str, dict[int, float]] = {
+        "flow_x": {3: 1.0}, "flow_y": {4: 1.0}, "flow_xx": {one: 1.0}, "flow_yy": {two: 1.0},
+        "flow_xy": {i: -a for i, a in turn.items()} | shear, "flow_yx": turn | shear,
+        "strain_xx": {one: 100.0}, "strain_yy": {two: 100.0}, "strain_xy": {both: 100.0},
+    }  # fmt: skip
+    spread = _Spread(covariance)
+    return {name: spread.rate(q, sums[name]) for name in plan.names}
+
+
+def _derived(plan: Refinement, q: Array, covariance: Array, rays: Array, f: float) -> dict[str, tuple[Array, Array]]:
+    """Maps and standard errors [n] from parameters [n, 15] and their covariance."""
+    spread = _Spread(covariance)
+    linear = spread.error
     found = {name: (q[:, i], linear({i: 1.0})) for i, name in enumerate(PARAMETERS[: 3 + plan.motion])}
     if plan.motion:
         for k, axis in enumerate("xy"):
@@ -218,6 +280,5 @@ def _derived(plan: Refinement, q: Array, covariance: Array, rays: Array, f: floa
         found["growth_rate"] = np.where(np.isfinite(rate), 100 * (area[0] / area[1] - 1), np.nan), rate
     if plan.modes == 3:
         for i, name in enumerate(STRAIN_NAMES):
-            std = linear({_GROWTH + i: 100.0})
-            found[name] = np.where(np.isfinite(std), 100 * q[:, _GROWTH + i], np.nan), std
+            found[name] = spread.rate(q, {_GROWTH + i: 100.0})
     return found

@@ -17,7 +17,7 @@ from leafflow_ti.identify import settle
 from leafflow_ti.plan import Plan
 from leafflow_ti.range_engine import Sample
 from leafflow_ti.reading import Box, Mask, Reader
-from leafflow_ti.refinement import PARAMETERS
+from leafflow_ti.refinement import starting
 from leafflow_ti.stages.estimate import View
 from leafflow_ti.stages.prefilter import Prefilter
 from leafflow_ti.stages.tensor import Band
@@ -63,7 +63,8 @@ class Stays:
         self.plan, self.reader = plan, reader
         # What a map's user is told depends on the standard errors of others, so all are there.
         inputs = INPUTS if plan.differences else ()
-        wanted = with_std(n for n in (*plan.quantities, *(PARAMETERS if plan.refine else ())) if n != "growth_rate")
+        started = starting(plan.refine) if plan.refine else ()
+        wanted = with_std(n for n in (*plan.quantities, *started) if n != "growth_rate")
         self.names = tuple(dict.fromkeys((*wanted, *inputs)))
         self._measured = {*plan.measured, *inputs}
 

@@ -58,6 +58,7 @@ CASES = (
     Case("estimators-filters", "estimators.filters:run", "Yosemite with every filter set and estimator (Table 2.1)"),
     Case("estimators-edges", "estimators.edges:run", "the cube within 20 px of its edges, plain and robust"),
     Case("estimators-coverage", "estimators.coverage:run", "whether error bars are true, by estimator and noise"),
+    Case("speckle", "speckle:run", "one camera as a strain gauge: rendered plate, rigid series, noise floor by window"),
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
     Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),
     Case("stages", "stages:run", "microseconds per output pixel and stage, share of the machine's ceilings; memory"),

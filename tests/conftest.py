@@ -16,7 +16,16 @@ from reference import estimators as weighted
 from leafflow_ti.field import MOTION_NAMES
 from leafflow_ti.filters import filter_set
 from leafflow_ti.growth import DIFFERENCES
-from leafflow_ti.models import BRIGHTNESS, MODELS, OWN_FLOW, ColumnSet, TensorLayout, column_set, parse_rows
+from leafflow_ti.models import (
+    BRIGHTNESS,
+    MODELS,
+    OWN_FLOW,
+    ColumnSet,
+    TensorLayout,
+    column_set,
+    flow_offsets,
+    parse_rows,
+)
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import EstimateStage, View
@@ -295,6 +304,8 @@ class Bench:
                 options["own_flows"] = OwnFlows(
                     columns, sampling, tuple(self.steps[i] for i in kept), own, unknowns, model.reference_rows, growth
                 )
+        elif not self.sampling.camera_axes:
+            options["offsets"] = flow_offsets(self.columns)
         problem = Problem(self.columns, self.sampling, **options)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("leafflow_ti.stages.estimate.BATCH_BYTES", 64 << 20)  # one batch: its workspace is looked at

@@ -9,6 +9,7 @@ import numpy as np
 
 import leafflow_ti as lf
 from leafflow_ti.capture import Geometry, capture_from_array
+from leafflow_ti.field import FLOW_GRADIENT_NAMES, PLANE_STRAIN_NAMES
 
 Array = np.ndarray
 Texture = Callable[[Array, Array], Array]
@@ -64,6 +65,7 @@ class Moving:
         depth = -F_PX * BASELINE_MM / DISPARITY
         known = {f"{q}_{a}": 0.0 for q, axes in (("slope", "xy"), ("rotation", "xyz"), ("velocity", "z")) for a in axes}
         known |= {"disparity": DISPARITY, "depth": depth}
+        known |= dict.fromkeys((*FLOW_GRADIENT_NAMES, *PLANE_STRAIN_NAMES), 0.0)
         for axis, u in zip("xy", self.flow, strict=True):
             known |= {f"flow_{axis}": u, f"velocity_{axis}": u * depth / F_PX}
         return known

@@ -45,8 +45,10 @@ X, Y = 53, 46
 
 @dataclass(frozen=True)
 class Case:
-    """A scene and how it is refined; ``motion``, ``modes``, ``terms``, ``steps``, ``degree`` as of
-    ``Refinement``."""
+    """A scene and how it is refined; ``motion``, ``modes``, ``terms``, ``steps``, ``degree``, ``flat`` as of
+    ``Refinement``. ``seen``: offsets of the frames that are there, None: all of the scene; ``interval``: time from one
+    frame of the scene to the next as the refinement is told, so that times need not be whole.
+    """
 
     scene: PlaneScene = SCENE
     size: int = 33
@@ -57,14 +59,21 @@ class Case:
     terms: int = 0
     steps: int = 12
     degree: int = 5
+    flat: bool = False
+    seen: tuple[int, ...] | None = None
+    interval: float = 1.0
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Offsets of the frames that are there."""
+        middle = self.scene.n_frames // 2
+        return self.seen or tuple(range(-middle, self.scene.n_frames - middle))
 
     @property
     def plan(self) -> Refinement:
-        scene = self.scene
-        middle = scene.n_frames // 2
         return Refinement(
-            self.steps, self.size, self.sigma, self.thin, tuple(range(-middle, scene.n_frames - middle)),
-            self.cameras, self.motion, self.modes, self.terms, degree=self.degree,
+            self.steps, self.size, self.sigma, self.thin, tuple(self.interval * t for t in self.frames),
+            self.cameras, self.motion, self.modes, self.terms, degree=self.degree, flat=self.flat,
         )  # fmt: skip
 
     @property
@@ -77,42 +86,65 @@ class Case:
     @property
     def shifts(self) -> np.ndarray:
         """Of every image [K, 2], px."""
-        return np.tile(np.array(self.cameras) * SHIFT, (self.scene.n_frames, 1))
+        return np.tile(np.array(self.cameras) * SHIFT, (len(self.frames), 1))
 
     @cached_property
     def images(self) -> np.ndarray:
         """Blocks [t, cameras, y, x] in single precision; they lie at ``shifts``."""
         scene = self.scene
         x, y = scene.principal
-        out = np.empty((scene.n_frames, len(self.cameras), *scene.size[::-1]), np.float32)
+        out = np.empty((len(self.frames), len(self.cameras), *scene.size[::-1]), np.float32)
+        frames = [t + scene.n_frames // 2 for t in self.frames]
         for k, (kx, ky) in enumerate(self.cameras):
             at = replace(scene, principal_px=(x - SHIFT[0] * kx, y - SHIFT[1] * ky))
             chosen = ([ky + scene.n_rows // 2], [kx + scene.n_cols // 2])
-            out[:, k] = render(at, cameras=chosen)[:, 0, 0]
+            out[:, k] = render(at, frames, chosen)[:, 0, 0]
         return out
+
+    def truth_at(self, x: int, y: int) -> np.ndarray:
+        """The state [15] at a pixel."""
+        state = true_state(truth(self.scene), x, y)
+        state[3:] /= self.interval
+        state[9:12] /= self.interval
+        if self.flat:
+            scale = self.scene.f_px / state[0]
+            state[:3], state[3:6], state[9:12] = (1, 0, 0), scale * state[3:6], scale * state[9:12]
+        return state
 
     @property
     def truth(self) -> np.ndarray:
         """The state [15] at the pixel (X, Y)."""
-        return true_state(truth(self.scene), X, Y)
+        return self.truth_at(X, Y)
+
+    def beside(self, state: np.ndarray) -> np.ndarray:
+        """States [..., 15] as an affine model gives them: a little wrong, without acceleration and growth."""
+        off = np.array([0.3, 0.01, 0.01, *[0.01] * 3, *[1e-4] * 3, *[0.0] * 6])
+        if self.flat:
+            off = 0.1 * directions(3, 0, flat=True).sum(axis=1)
+        state = state + off
+        state[..., 3 + min(self.motion, 6) :] = 0.0
+        return state
 
     @property
     def start(self) -> np.ndarray:
-        """A state as an affine model gives it: a little wrong, without acceleration and growth."""
-        state = self.truth + np.array([0.3, 0.01, 0.01, *[0.01] * 3, *[1e-4] * 3, *[0.0] * 6])
-        state[3 + min(self.motion, 6) :] = 0.0
-        return state
+        """Beside the truth at the pixel (X, Y)."""
+        return self.beside(self.truth)
 
     @property
     def unknowns(self) -> np.ndarray:
         """Directions [15, n] of the state that are estimated."""
-        return directions(self.motion, self.modes)
+        return directions(self.motion, self.modes, self.flat)
 
     def window(self, x: int = X, y: int = Y) -> twin.Window:
         """What the twin refines at a pixel."""
+        times, n = np.array(self.plan.frames), len(self.cameras)
+        views, principal = Views.of(self.scene, x, y), self.scene.principal
+        views = replace(views, cameras=np.tile(views.cameras[:n], (len(times), 1)), times=np.repeat(times, n))
+        if self.flat:
+            views, principal = replace(views, f_px=1.0, x0=0.0, y0=0.0), (x, y)
         return twin.Window(
-            Views.of(self.scene, x, y), self.scene.principal, self.size, self.sigma, self.thin, self.motion, self.modes,
-            self.terms, self.shifts,
+            views, principal, self.size, self.sigma, self.thin, self.motion, self.modes, self.terms, self.shifts,
+            self.flat,
         )  # fmt: skip
 
     def twin(self, images: np.ndarray | None = None, window: twin.Window | None = None, **options: Any) -> twin.Refined:
@@ -148,16 +180,16 @@ def at_pixels(
     """What the kernels find at pixels (x, y), from ``start`` [15 or n, 15]."""
     x, y = np.array(pixels).T
     rays = np.column_stack([x - scene.principal[0], y - scene.principal[1]])
+    if stage.plan.flat:
+        rays = np.zeros(rays.shape)
     return stage(y, x, rays, np.broadcast_to(start, (len(x), 15)))
 
 
 def estimated(state: np.ndarray, case: Case) -> np.ndarray:
     """The unknowns [..., n] in a state [..., 15] of the kernels, which have isotropic growth in one place."""
-    n = 3 + case.motion
-    return np.concatenate([state[..., :n], state[..., 12 : 12 + case.modes]], axis=-1)
+    return np.asarray(state[..., list(case.plan.estimated)])
 
 
 def covariance(found: Refined, case: Case, i: int = 0) -> np.ndarray:
     """Covariance [n, n] of the unknowns."""
-    which = np.r_[0 : 3 + case.motion, 12 : 12 + case.modes]
-    return np.asarray(found.covariance[i][np.ix_(which, which)])
+    return np.asarray(found.covariance[i][np.ix_(case.plan.estimated, case.plan.estimated)])

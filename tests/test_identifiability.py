@@ -64,6 +64,12 @@ def test_stripes_determine_the_flow_across_them_alone(model: str, estimator: str
         assert share(field, "flow") <= 0.02
         assert known(field, f"flow_{lost}") <= 0.02
         assert known(field, f"flow_{'x' if lost == 'y' else 'y'}") >= 0.98
+        if model == "flow-affine":
+            kept = "x" if lost == "y" else "y"
+            assert share(field, "flow_gradient") <= 0.02
+            for name in (f"flow_{lost}x", f"flow_{lost}y", f"strain_{lost}{lost}", "strain_xy"):
+                assert known(field, name) <= 0.02, name
+            assert known(field, f"strain_{kept}{kept}") >= 0.98
     field = Moving(stripes(0.8)).measure(model, estimator=estimator)
     assert known(field, "flow_x") <= 0.02
     assert known(field, "flow_y") <= 0.02
@@ -85,7 +91,7 @@ def test_stripes_along_the_cameras_determine_no_depth(model: str) -> None:
 def test_texture_in_all_directions_identifies_every_group(model: str) -> None:
     field = Moving(checks).measure(model)
     grid = ["depth", "normals", "translation", "rotation"] if not model.startswith("flow") else []
-    wanted = ["flow", *grid]
+    wanted = ["flow", *(["flow_gradient"] if model == "flow-affine" else []), *grid]
     assert {group for group in IDENTIFIED if share(field, group) == 1} == set(wanted)
     assert {group for group in IDENTIFIED if share(field, group) > 0} == set(wanted)
 

@@ -43,6 +43,7 @@ def make(folder: Path, names: tuple[str, ...], empty: bool = False) -> ResultSto
         (STEREO, {"depth", "normals", "status", "overview"}),
         (("disparity",), {"depth", "status", "overview"}),
         (FLOW, {"flow", "status", "overview"}),
+        ((*FLOW, "strain_xx", "strain_yy", "strain_xy"), {"flow", "strain", "status", "overview"}),
     ],
 )
 def test_pictures_follow_the_maps(tmp_path: Path, names: tuple[str, ...], pages: set[str]) -> None:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
-from leafflow_ti.config import load_config
+from leafflow_ti.config import load_config, resolve
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.plan import Plan, make_plan
-from leafflow_ti.refine_plan import Refinement
+from leafflow_ti.refine_plan import Refinement, plan_refinement
 from leafflow_ti.splines import filter_radius
 
 
@@ -121,11 +122,64 @@ def test_the_plan_says_what_was_decided() -> None:
     assert "stride 4:" in text
 
 
+GRADIENT, STRAIN = ("flow_xx", "flow_xy", "flow_yx", "flow_yy"), ("strain_xx", "strain_yy", "strain_xy")
+
+
+@pytest.mark.parametrize("model", ["flow", "flow-affine", "flow-quadratic"])
+@pytest.mark.parametrize(
+    ("options", "estimated", "without"),
+    [
+        ({}, (3, 4, 8, 9, 10, 12, 13, 14), ()),
+        ({"motion": "acceleration", "deformation": "growth"}, (3, 4, 8, 9, 10, 12), ("strain_xy",)),
+        ({"deformation": "none"}, (3, 4, 8, 9, 10), ("flow_xx", "flow_yy", *STRAIN)),
+        ({"motion": "translation", "deformation": "strain"}, (3, 4, 12, 13, 14), ()),
+        ({"motion": "translation", "deformation": "none"}, (3, 4), (*GRADIENT, *STRAIN)),
+    ],
+)
+def test_one_camera_sees_a_flat_patch(
+    model: str, options: dict[str, Any], estimated: tuple[int, ...], without: tuple[str, ...]
+) -> None:
+    """What is taken to be 0 has no map; what the model alone would have, the refinement has instead."""
+    planned = plan(capture(rows=3), model=model, refine=3, **options)
+    found = planned.refine
+    assert found is not None
+    assert (found.flat, found.cameras, found.estimated) == (True, ((0, 0),), estimated)
+    wanted = {n for n in ("flow_x", "flow_y", *GRADIENT, *STRAIN) if n not in without}
+    assert set(found.names) == wanted
+    assert {n for n in planned.quantities if n.startswith(("flow", "strain"))} == wanted
+    assert f"{len(estimated)} unknowns (flow" in planned.describe()
+
+
+def test_the_window_of_one_camera_is_thinned_little() -> None:
+    thins = [refined(model="flow-affine", refine=3, window=w).thin for w in (33, 65, 85)]
+    assert thins == [1, 2, 2]
+    assert refined(model="flow-affine", refine=3, window=65, thin=4).thin == 4
+    assert refined(model="affine-4d", refine=3, window=65).thin == 3
+
+
+def test_refining_the_flow_must_be_asked_for() -> None:
+    for preset in ("fast", "balanced", "accurate"):
+        assert plan(capture(cols=1), preset=preset).refine is None
+
+
+def test_range_flow_of_one_camera_is_not_flat() -> None:
+    config = load_config(overrides={"model": "range-flow", "refine": 2, "window": 33})
+    with pytest.raises(ConfigError, match=r"refine\.steps = 2: model 'range-flow' reads one camera.*flow-affine"):
+        plan_refinement(resolve(config, 9, 1, 1), range(-2, 3), [(0, 0)], (96, 128))
+
+
+def test_times_need_not_be_whole() -> None:
+    found = replace(refined(model="flow-affine", refine=3), frames=(-2.3, 0.0, 0.4))
+    assert found.reach == 5 + 4
+
+
 @pytest.mark.parametrize(
     ("of", "options", "message"),
     [
-        ({}, {"model": "flow-affine", "refine": 3}, "refine.steps = 3: model 'flow-affine' reads one camera"),
-        ({"cols": 1}, {"refine": 2}, "refine.steps = 2: model 'flow-affine' reads one camera.*--refine 0"),
+        ({}, {"model": "flow-affine", "motion": "rotation"}, "model 'flow-affine' does not have it"),
+        ({}, {"model": "flow-affine", "deformation": "none"}, "only the refinement has a choice: give --refine 3"),
+        ({}, {"model": "flow", "deformation": "growth"}, "only the refinement has a choice: give --refine 3"),
+        ({}, {"model": "flow-quadratic", "deformation": "strain"}, "only the refinement has a choice: give --refine 3"),
         ({}, {"deformation": "strain", "refine": 0}, "'strain' is measured by the refinement alone: give --refine 3"),
         ({}, {"deformation": "strain", "preset": "fast"}, "'strain' is measured by the refinement alone"),
         ({}, {"deformation": "growth", "refine": 0, "model": "affine-4d"}, "choose affine-scene-flow, or a refinement"),

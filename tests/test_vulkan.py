@@ -19,6 +19,7 @@ import pytest
 import test_estimators
 import test_kernels_tensor
 import test_range_flow
+import test_refine
 from reference import chain, patch
 from refine_bench import SCENE, Case, covariance, estimated
 from test_kernels_estimate import assert_maps_equal
@@ -35,6 +36,7 @@ PIXELS = ((0, 0), (1, 3), (2, 4))
 SYSTEMS = [
     ("depth", "none", "line-x", None),
     ("depth", "camera", "square", None),
+    ("flow-affine", "none", "single", None),
     ("affine-4d", "none", "line-x", "rotation"),
     ("affine-scene-flow", "temporal", "line-x", "acceleration"),
 ]
@@ -163,3 +165,12 @@ def on_vulkan_the_refinement_equals_the_twin(device: Callable) -> None:
 
 def on_vulkan_the_search_equals_its_twin(device: Callable) -> None:
     assert_search_equals_twin(device("f32"), "line", 0.5, 1e-5)
+
+
+def on_vulkan_a_flat_patch_equals_the_twin(device: Callable) -> None:
+    case = test_refine.CASES["flat, uneven times"]
+    found, wanted = case.refine(device("f32")), case.twin()
+    assert found.converged.all()
+    errors = np.sqrt(np.diag(wanted.covariance))
+    assert np.abs(estimated(found.parameters[0] - wanted.state, case) / errors).max() < 0.05
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance(found, case))) / errors, 0.997, atol=0.015)

@@ -105,7 +105,9 @@ RefineWindow = Annotated[
 Thin = Annotated[
     str | None,
     _text(
-        "thin", "auto|PIXELS", "The refinement takes every PIXELS-th pixel [auto: a 21st of its window; accurate: 1]."
+        "thin",
+        "auto|PIXELS",
+        "The refinement takes every PIXELS-th pixel [auto: a 21st of it, 2 at most for one camera; accurate: 1].",
     ),
 ]
 Taps = Annotated[str | None, _text("taps", "3x1x1|3|5|7", "Derivative filters [5].")]

@@ -15,13 +15,23 @@ from leafflow_ti.status import Status
 
 
 class Output(IntEnum):
-    """Planes of the output stack; the standard error of plane p is plane ``STD + p``."""
+    """Planes of the output stack; the standard error of plane p is plane ``STD + p``.
+
+    No model has both a motion in space and derivatives of one camera's flow: they share planes.
+    """
 
     DISPARITY = 0
     DEPTH = 1
     SLOPE_X = 2
     SLOPE_Y = 3
     MOTION = 4  # 9: velocity, rotation, acceleration
+    FLOW_XX = 4
+    FLOW_XY = 5
+    FLOW_YX = 6
+    FLOW_YY = 7
+    STRAIN_XX = 8
+    STRAIN_YY = 9
+    STRAIN_XY = 10
     FLOW_X = 13
     FLOW_Y = 14
     BRIGHTNESS_T = 15
@@ -195,6 +205,25 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
         return region(p, number, Region.PARAMETERS) + column * p.stride
 
     @ti.func
+    def flow_gradient(p: ti.template(), number: ti.template(), ws: ti.template()):
+        """The flow's derivatives along x and y, and their symmetric part: strain of the image plane, in per cent.
+
+        Rows are those of u, then of v: each with its derivatives along x and y.
+        """
+        target, rows = region(p, number, Region.OUT), region(p, number, Region.COV_T)
+        for k in range(2):
+            for axis in range(2):
+                row = 3 * k + 1 + axis
+                value, variance = ws[parameter(row, p, number)], ws[rows + tri(row, row) * p.stride]
+                put(Output.FLOW_XX + 2 * k + axis, value, variance, p, target, ws)
+                if k == axis:
+                    put(Output.STRAIN_XX + k, 100.0 * value, 1e4 * variance, p, target, ws)
+        shear = ws[parameter(2, p, number)] + ws[parameter(4, p, number)]
+        variance = ws[rows + tri(2, 2) * p.stride] + ws[rows + tri(4, 4) * p.stride]
+        variance = variance + 2.0 * ws[rows + tri(4, 2) * p.stride]
+        put(Output.STRAIN_XY, 50.0 * shear, 2500.0 * variance, p, target, ws)
+
+    @ti.func
     def world(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """Brightness changes of the material (4.28): slopes along X and Y, and the trend without what moves past.
 
@@ -259,6 +288,8 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
                 flowing = ws[found + column * p.stride] + value[p.v + Value.MOTION_SHIFT + k]
                 put(Output.FLOW_X + k, flowing, variance, p, target, ws)
             normal_flow(p, number, ws)
+            if number[p.n + Number.UNKNOWNS] == 0 and number[p.n + Number.OFFSETS] > 1:
+                flow_gradient(p, number, ws)
         if number[p.n + Number.BRIGHTNESS_COLUMN] >= 0:
             for j in range(number[p.n + Number.CAMERA_SOLUTIONS]):
                 at = found + (j * flow + number[p.n + Number.BRIGHTNESS_COLUMN]) * p.stride

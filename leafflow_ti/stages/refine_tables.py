@@ -64,7 +64,7 @@ class RefineTables:
 
         pieces = spline_pieces(plan.degree).ravel()
         value = np.zeros(Value.SPLINE + pieces.size)
-        value[Value.FOCAL], value[Value.HALF] = view.f_px, plan.size / 2
+        value[Value.FOCAL], value[Value.HALF] = 1.0 if plan.flat else view.f_px, plan.size / 2
         value[Value.SMOOTHING] = 0.5 * (PIXEL_VARIANCE + PREFILTER_SIGMA**2)
         value[Value.LIMIT] = plan.size // 2 + plan.reach
         both = 2 * correlation.sum() - 1
@@ -111,7 +111,7 @@ def _sizes(plan: Refinement, lanes: int, gpu: bool) -> tuple[NDArray[np.int32], 
     """The table ``size`` but for the images' pitch and the noise, and the vectors of a pixel's two workspaces."""
     from leafflow_ti.kernels.refine_tables import DERIVATIVES, FUNCTIONS, SHIFTS, TERMS, Geometry, Scalar, Size, Warp
 
-    unknowns = _unknowns(plan)
+    unknowns = plan.estimated
     n, k = len(unknowns), len(plan.frames) * len(plan.cameras)
     images, groups = -(-k // lanes), -(-(plan.across**2) // lanes)
     size = np.zeros(Size.LIST + n, np.int32)
@@ -138,13 +138,6 @@ def _sizes(plan: Refinement, lanes: int, gpu: bool) -> tuple[NDArray[np.int32], 
     })  # fmt: skip
     size[Size.SLOT_REAL], size[Size.SLOT_PRECISE] = slot_real, slot_precise
     return size, slot_real, slot_precise
-
-
-def _unknowns(plan: Refinement) -> list[int]:
-    """Which of the fifteen parameters are estimated."""
-    from leafflow_ti.kernels.refine_tables import GROWTH
-
-    return [*range(3 + plan.motion), *range(GROWTH, GROWTH + plan.modes)]
 
 
 def _lay_out(size: NDArray[np.int32], lengths: dict[Any, int]) -> int:

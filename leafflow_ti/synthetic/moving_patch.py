@@ -66,14 +66,20 @@ def true_state(maps: Mapping[str, Array], x: int, y: int) -> Array:
     return np.concatenate([plane, maps["velocity"][y, x], maps["omega"], maps["acceleration"][y, x], strain])
 
 
-def directions(motion: int, modes: int) -> Array:
-    """Directions [15, 3 + motion + modes] of the state that are unknown, columns in the order of ``UNKNOWNS``.
+IN_PLANE = ("velocity_x", "velocity_y", "rotation_z", "acceleration_x", "acceleration_y")
+"""What moves a plane within itself where it faces the camera."""
+
+
+def directions(motion: int, modes: int, flat: bool = False) -> Array:
+    """Directions [15, n] of the state that are unknown, columns in the order of ``UNKNOWNS``.
 
     ``motion``: the first 0, 3, 6 or 9 of N, Ω, A. ``modes`` of growth: 0, 1 (the same in all directions) or 3.
+    ``flat``: depth and slopes are known, and of the motion only what is ``IN_PLANE`` is not.
     """
     every = np.eye(len(UNKNOWNS))
     growth = {0: every[:, :0], 1: every[:, 12:13] + every[:, 13:14], 3: every[:, 12:]}[modes]
-    return np.concatenate([every[:, : 3 + motion], growth], axis=1)
+    rigid = [i for i in range(3 + motion) if not flat or UNKNOWNS[i] in IN_PLANE]
+    return np.concatenate([every[:, rigid], growth], axis=1)
 
 
 def warp(views: Views, state: Array, offsets: Array, k: int) -> Array:

@@ -320,7 +320,7 @@ def measure(solved, problem, view, x, y, own=()):
                 i = columns.index(a)
                 found[f"flow_{a}"] = (P[i, k], np.sqrt(cov[k, k, i, i]))
     if not problem.camera_axes:
-        return found
+        return {**found, **flow_gradient(P[:, 0], cov[0, 0], columns)}
     geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
     g, cov_g = geometry[1][:3], geometry[2][:3, :3]
     step = view.baseline_mm[0 if problem.camera_axes[0] == "sx" else 1]
@@ -358,6 +358,17 @@ def measure(solved, problem, view, x, y, own=()):
         for name, value, variance in zip(("x", "y", "tt"), values, np.diag(spread), strict=False):
             found[f"brightness_world_{name}"] = (value, np.sqrt(variance))
     return found
+
+
+def flow_gradient(p, cov, columns: ColumnSet):
+    """Derivatives of one camera's flow from its parameters p [n_flow], and their symmetric part in per cent."""
+    columns_of = {c + o: columns.index(c, o) for c in ("x", "y") for o in ("x", "y")}
+    if None in columns_of.values():
+        return {}
+    unit = {name: np.eye(len(p))[i] for name, i in columns_of.items()}
+    weights = {f"flow_{name}": e for name, e in unit.items()}
+    weights |= {f"strain_{a}{b}": 50 * (unit[a + b] + unit[b + a]) for a, b in ("xx", "yy", "xy")}
+    return {name: (w @ p, np.sqrt(w @ cov @ w)) for name, w in weights.items()}
 
 
 def velocity_differences(solved, problem, view, x, y, own=()):

@@ -27,8 +27,9 @@ DEGREE = 5
 class Window:
     """Where and how one pixel is refined; ``views`` [K images], ``principal`` (px, py), ``sigma`` [px] of the window.
 
-    ``motion``, ``modes``: unknowns as in ``directions``; ``terms`` of light per image, 0 or 1, 3, 6. ``shifts`` [K, 2]:
-    pixels by which the images lie further to the left and up than their cameras saw them (None: none do).
+    ``motion``, ``modes``, ``flat``: unknowns as in ``directions``; ``terms`` of light per image, 0 or 1, 3, 6.
+    ``shifts`` [K, 2]: pixels by which the images lie further to the left and up than their cameras saw them (None: none
+    do).
     """
 
     views: object
@@ -40,11 +41,12 @@ class Window:
     modes: int = 0
     terms: int = 0
     shifts: np.ndarray | None = None
+    flat: bool = False
 
     def __post_init__(self):
         self.offsets = window(self.size, self.thin)
         self.weights = np.exp(-0.5 * np.sum(self.offsets**2, axis=1) / self.sigma**2)
-        self.along = directions(self.motion, self.modes)
+        self.along = directions(self.motion, self.modes, self.flat)
         self.light = light_terms(self.offsets, self.size, self.terms)
         self.images = range(len(self.views.times))
         if self.shifts is None:
