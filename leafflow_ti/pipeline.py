@@ -153,8 +153,9 @@ class Pipeline:
         """
         plan = self.plan
         reach = plan.reach(axis) if plan.config.window.border == "full" else 0
-        shifts = [plan.preshift[pair] * (k - self.capture.reference[1 - pair]) for k in plan.cameras[1 - pair]]
-        first, last = reach - min(shifts), size - 1 - reach - max(shifts)
+        read, cameras = self.capture.pixels_read(plan.preshift), list(plan.cameras[1 - pair])
+        lowest, highest = (n[cameras] for n in (read[2:] if pair == 0 else read[:2]))
+        first, last = reach - int(lowest.min()), size - 1 - reach - int(highest.max())
         inside = [i for i, p in enumerate(positions) if first <= p <= last]
         return slice(inside[0], inside[-1] + 1) if inside else slice(0, 0)
 
@@ -162,9 +163,11 @@ class Pipeline:
         """The output grid whose first pixel is (row, column) ``corner``."""
         plan, geometry = self.plan, self.plan.geometry
         offset = geometry.disparity_offset_px
-        shift = (plan.preshift[0] + offset[0], plan.preshift[1] + offset[1])
+        shift, baseline = (plan.preshift[0] + offset[0], plan.preshift[1] + offset[1]), geometry.baseline_mm
+        if self.capture.positions_mm is not None:
+            shift, baseline = geometry.along_both(shift), geometry.along_both(baseline)
         return View(
-            geometry.f_px, geometry.principal_px, geometry.baseline_mm, shift,
+            geometry.f_px, geometry.principal_px, baseline, shift,
             self._x[corner[1]], self._y[corner[0]], plan.x.step, band.rows, band.cols, pitch,
         )  # fmt: skip
 
@@ -183,7 +186,9 @@ class Pipeline:
             return
         stay = self._move(index)
         engine, latency = stay.engine, stay.engine.tensor.latency
-        frames = range(plan.frames[first] - latency, plan.frames[last] + latency + 1)
+        before = plan.problem.sampling.t.before
+        frames = range(plan.frames[first] - before, plan.frames[last] + latency + 1)
+        engine.reset(frames.start)
         waiting: deque[Sample] = deque(maxlen=latency + 1)
         with contextlib.closing(self._reader.blocks(frames, stay.box)) as blocks:
             for t in frames:
@@ -195,6 +200,7 @@ class Pipeline:
                     if tensors is None:
                         continue
                     self.device.synchronize()
+                    engine.set_frame(t - latency)
                     maps, status = self._maps(engine.estimate(tensors), waiting[0], stay.centre)
                     result = self._frame_of(index, maps, status, stay)
                 yield plan.unit(first + t - latency - plan.frames[first], index), *result

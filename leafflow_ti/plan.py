@@ -20,6 +20,7 @@ from leafflow_ti.models import MODELS, TensorLayout
 from leafflow_ti.noise import noise_level
 from leafflow_ti.range_plan import RangePlan, range_problem
 from leafflow_ti.refine_plan import Refinement, plan_refinement
+from leafflow_ti.sampling import AxisSampling
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, Problem
 
@@ -163,7 +164,8 @@ class Plan:
 
         def axis(name: str) -> str:
             plan = sampling.axis(name)
-            taps = f"{len(plan.filters.smooth)} taps" if plan.filters else "no filter"
+            taps = f"{plan.taps} taps" if plan.filters else "no filter"
+            taps += ", at measured places" if plan.uneven or (name in ("sx", "sy") and sampling.grid) else ""
             blocks = f" in {len(plan.blocks.weights)} blocks of {plan.blocks.step}" if plan.blocks else ""
             return f"{name}: {taps}, window of {plan.size}{blocks}"
 
@@ -245,11 +247,11 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         own = replace(depth, noise=noise) if depth else None
         preshift = _preshift(capture, config) if own else (0, 0)
         alone = sampling_of(capture, config, "reference", True)
-        frames = _frames(capture, config, alone.t.radius, True)
+        frames = _frames(capture, config, alone.t)
         problem, ranges = range_problem(capture, config, alone, frames, own, preshift, noise)
     else:
         problem = model_problem(capture, config, name, motion)
-        frames = _frames(capture, config, problem.sampling.t.radius, model.time)
+        frames = _frames(capture, config, problem.sampling.t if model.time else None)
         preshift = _preshift(capture, config) if problem.camera_axes else (0, 0)
     problem = replace(problem, noise=noise)
     layout = TensorLayout.of(problem.columns)
@@ -262,11 +264,11 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     x, y = range(x0, x1, stride), range(y0, y1, stride)
     grid = (ranges.depth if ranges and ranges.depth else problem).sampling
     cameras = cameras_read(grid, problem.own_flows, *capture.reference)
-    row, col = capture.reference
+    steps_x, steps_y = capture.camera_steps
     refine = plan_refinement(
         config,
-        range(-problem.sampling.t.radius, problem.sampling.t.radius + 1) if model.time else None,
-        [(sx - col, sy - row) for sy in cameras[0] for sx in cameras[1]],
+        _farthest(problem.sampling.t, frames) if model.time else None,
+        [(float(steps_x[sy, sx]), float(steps_y[sy, sx])) for sy in cameras[0] for sx in cameras[1]],
         (capture.height, capture.width),
     )
     plan = Plan(
@@ -283,17 +285,27 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     return replace(plan, bytes=memory + cache, cache_bytes=cache)
 
 
-def _frames(capture: Capture, config: RunConfig, radius: int, has_time: bool) -> tuple[int, ...]:
+def _frames(capture: Capture, config: RunConfig, time: AxisSampling | None) -> tuple[int, ...]:
+    """Frames that are measured; ``time``: the sampling along time, None without."""
     wanted = config.output.frame_range(capture.n_frames)
-    if not has_time:
+    if time is None:
         return tuple(wanted)
-    frames = tuple(t for t in wanted if radius <= t < capture.n_frames - radius)
+    first, end = time.before, capture.n_frames - time.after
+    frames = tuple(t for t in wanted if first <= t < end)
     if not frames:
         raise ConfigError(
-            f"output.frames = {config.output.frames!r}: the temporal window reaches {radius} frames to each side, "
-            f"so frames {radius}:{capture.n_frames - radius} can be measured"
+            f"output.frames = {config.output.frames!r}: the temporal window reaches from {time.before} frames before "
+            f"to {time.after} behind, so frames {first}:{end} can be measured"
         )
     return frames
+
+
+def _farthest(time: AxisSampling, frames: tuple[int, ...]) -> tuple[float, ...]:
+    """Offsets of the frames of a window; where they differ from one reference to the next, the farthest."""
+    if not time.uneven:
+        return tuple(time.positions.tolist())
+    found = (tuple(time.about(t).positions.tolist()) for t in frames)
+    return max(found, key=lambda offsets: max(map(abs, offsets)))
 
 
 def _geometry(capture: Capture) -> Geometry:

@@ -74,12 +74,14 @@ class Reader:
 
     def seen(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> tuple[Mask, Mask]:
         """Which rows ``y`` [cameras along y, n] and columns ``x`` [cameras along x, n] of blocks lie inside images."""
-        capture, shift = self.capture, self.plan.preshift
-        rows, cols = (
-            np.array(cameras)[:, None] - n for cameras, n in zip(self.plan.cameras, capture.reference, strict=True)
+        capture = self.capture
+        read = capture.pixels_read(self.plan.preshift)
+        rows, cols = (list(cameras) for cameras in self.plan.cameras)
+        first_y, last_y, first_x, last_x = (
+            n[some][:, None] for n, some in zip(read, (rows, rows, cols, cols), strict=True)
         )
-        in_y, in_x = y + shift[1] * rows, x + shift[0] * cols
-        return (in_y >= 0) & (in_y < capture.height), (in_x >= 0) & (in_x < capture.width)
+        in_y = (y + first_y >= 0) & (y + last_y < capture.height)
+        return in_y, (x + first_x >= 0) & (x + last_x < capture.width)
 
     def inside(self, box: Box) -> Mask:
         """Where every camera sees its image and the mask allows a measurement: [rows, cols]."""

@@ -5,6 +5,7 @@ A pure value; stages and kernels read it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -25,7 +26,8 @@ class Refinement:
     """At most ``steps`` Gauss-Newton steps on the exact moving patch.
 
     ``size``, ``sigma``: Gaussian window [px], of which every ``thin``-th pixel around the centre is a sample.
-    ``frames``: offsets from the reference frame; ``cameras``: (x, y) steps from the reference camera, in the order of
+    ``frames``: offsets from where the results lie in time; where frames are uneven, each reference frame has its own,
+    and these are the farthest. ``cameras``: (x, y) steps from the reference camera, in the order of
     a block's images (rows, then columns). Unknowns are depth and slopes (Z0, ZX, ZY); ``motion``: how many of
     (N, Ω, A): 0, 3, 6 or 9; ``modes`` of the deformation in the patch's plane: 0, 1 (growth alike in all directions),
     3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6. ``degree``
@@ -36,8 +38,8 @@ class Refinement:
     size: int
     sigma: float
     thin: int
-    frames: tuple[int, ...]
-    cameras: tuple[tuple[int, int], ...]
+    frames: tuple[float, ...]
+    cameras: tuple[tuple[float, float], ...]
     motion: int
     modes: int
     terms: int
@@ -57,7 +59,7 @@ class Refinement:
     def reach(self) -> int:
         """Pixels that a sample may lie from its place in the preshifted window."""
         steps = max(max(abs(x), abs(y)) for x, y in self.cameras)
-        return steps + 2 * max(abs(t) for t in self.frames) + 4
+        return math.ceil(steps + 2 * max(abs(t) for t in self.frames)) + 4
 
     @property
     def halo(self) -> int:
@@ -117,11 +119,14 @@ def samples_across(size: int, thin: int) -> int:
 
 
 def plan_refinement(
-    config: RunConfig, temporal: range | None, cameras: Iterable[tuple[int, int]], image: tuple[int, int]
+    config: RunConfig,
+    temporal: tuple[float, ...] | None,
+    cameras: Iterable[tuple[float, float]],
+    image: tuple[int, int],
 ) -> Refinement | None:
     """The refinement that a resolved configuration asks for; None: none.
 
-    ``temporal``: frame offsets under filters and window of the model, None if it is static; ``cameras``: as of
+    ``temporal``: offsets of the frames under filters and window of the model, None if it is static; ``cameras``: as of
     ``Refinement``, all that are read; ``image``: rows and columns. Raises ConfigError where they do not fit.
     """
     model, window, cameras = config.model, config.window, tuple(cameras)
@@ -161,5 +166,5 @@ def plan_refinement(
     curved = model.brightness != "none" and model.brightness_terms in ("space", "both")
     terms = 6 if curved else _TERMS[model.brightness]
     sigma = window.sigma * size / window.size
-    frames = tuple(temporal or (0,))
+    frames = temporal or (0.0,)
     return Refinement(steps, size, sigma, thin, frames, cameras, motion, modes, terms, int(config.refine.spline))

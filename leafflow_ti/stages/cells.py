@@ -15,8 +15,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.blocks import Blocks
 from leafflow_ti.models import AXES, Entry
-from leafflow_ti.sampling import Blocks, channel_noise
+from leafflow_ti.sampling import channel_noise
 from leafflow_ti.stages.channels import MASS, MapKey, Request
 from leafflow_ti.stages.windows import BlockMap
 

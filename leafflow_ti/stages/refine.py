@@ -82,6 +82,7 @@ class RefineStage:
             device.array(tables.size, "int"), device.array(tables.value, "algebra"),
             device.vectors(device.array(tables.image, "algebra"), lanes),
         )  # fmt: skip
+        self._image, self._frames = tables.image, plan.frames
         self._samples = device.vectors(device.array(tables.sample), lanes)
         storage, algebra = (np.dtype(device.real(kind)).itemsize for kind in ("storage", "algebra"))
         space = Workspaces.of(plan, lanes, (storage, algebra), device.gpu, device.threads)
@@ -96,6 +97,18 @@ class RefineStage:
         """Forget all frames."""
         self._slots.clear()
         self._next = 0
+
+    def set_frames(self, offsets: tuple[float, ...]) -> None:
+        """Enter the frames' offsets from where the results lie, as many as the plan has."""
+        from leafflow_ti.kernels.refine_tables import Image
+
+        if offsets == self._frames:
+            return
+        assert len(offsets) == len(self._frames)
+        n, lanes = len(self.plan.cameras), self.device.dense.lanes
+        self._frames = offsets
+        self._image[Image.TIME, : n * len(offsets)] = np.repeat(offsets, n)
+        self._tables = (*self._tables[:2], self.device.vectors(self.device.array(self._image, "algebra"), lanes))
 
     def push(self, block: Array, finite: NDArray[np.bool_]) -> None:
         """Take the next frame: images [sy, sx, rows, cols] and where each is a grey value of an image."""
