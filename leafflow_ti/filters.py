@@ -80,9 +80,14 @@ class FilterSet:
         """The set of a signal that a Gaussian of ``sigma`` samples has smoothed; itself for 0."""
         if sigma == 0.0:
             return self
-        gaussian = gaussian_weights(2 * math.ceil(BLUR_CUT * sigma) + 1, sigma)
+        gaussian = gaussian_weights(2 * blur_radius(sigma) + 1, sigma)
         derivative, smooth = (np.convolve(self.kernel(d), gaussian) for d in (True, False))
         return FilterSet(f"{self.name}, blur {sigma:g}", tuple(derivative.tolist()), tuple(smooth.tolist()))
+
+
+def blur_radius(sigma: float) -> int:
+    """Half length of the Gaussian of ``FilterSet.blurred``."""
+    return math.ceil(BLUR_CUT * sigma)
 
 
 def filter_set(name: str) -> FilterSet:

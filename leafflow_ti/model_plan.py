@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from leafflow_ti.capture import Capture
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError, InputError
-from leafflow_ti.filters import FilterSet, choose_filter_set, filter_set
+from leafflow_ti.filters import FilterSet, blur_radius, choose_filter_set, filter_set
 from leafflow_ti.models import MODELS, OWN_FLOW, Model, column_set, parse_rows
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.problem import OwnFlows, Problem, unknowns_of
@@ -136,7 +136,8 @@ def sampling_of(capture: Capture, config: RunConfig, cameras: str, time: bool) -
     pixel = AxisSampling.gaussian(filters, w.size, w.sigma, int(w.stride))
     along_t = AxisSampling()
     if time:
-        frames = _Series("frames", config.filters.taps_time, w.size_time, w.sigma_time, taps)
+        chosen = config.filters
+        frames = _Series("frames", chosen.taps_time, w.size_time, w.sigma_time, taps, chosen.blur_time)
         along_t = frames.sequence(capture.n_frames, capture.frame_times)
     cameras_of = _Series("cameras", config.filters.taps_camera, w.size_camera, w.sigma_camera, taps)
     along_x, along_y, grid = _cameras(capture, cameras_of, cameras)
@@ -175,13 +176,15 @@ def _at_places(axis: AxisSampling, sigma: float, places: NDArray[np.float64], ce
 
 @dataclass(frozen=True)
 class _Series:
-    """What is asked of the filters and the window along a camera or time axis; ``what``: its samples in words."""
+    """What is asked of the filters and the window along a camera or time axis; ``what``: its samples in words;
+    ``blur``: of the filters, in samples."""
 
     what: str
     taps: str
     size: int | str
     sigma: float
     largest: str
+    blur: float = 0.0
 
     def line(self, n: int, centre: int) -> AxisSampling:
         """For ``n`` cameras with the reference at index ``centre``."""
@@ -197,17 +200,20 @@ class _Series:
 
     def _chosen(self, n: int, usable: int) -> tuple[FilterSet, int]:
         """Filters and window size where ``usable`` of ``n`` samples lie around the middle one."""
-        chosen = None
+        wider = 2 * blur_radius(self.blur)
         if self.taps != "auto":
-            chosen = filter_set(self.taps)
+            chosen: FilterSet | None = filter_set(self.taps)
         elif usable == 2:
             chosen = filter_set("2")
         else:
-            chosen = choose_filter_set(usable, self.largest)
+            chosen = choose_filter_set(usable - wider, self.largest)
+        chosen = chosen and chosen.blurred(self.blur)
         if chosen is None or chosen.taps > usable:
-            needed = 3 if chosen is None else chosen.taps
+            needed = 3 + wider if chosen is None else chosen.taps
+            less = f", or less than blur_time {self.blur:g}" if wider else ""
             raise InputError(
                 f"{n} {self.what} are too few: {needed} around the middle one are needed: record more, or use 3 taps"
+                + less
             )
         longest = usable - chosen.taps + 1
         longest -= 1 - longest % 2

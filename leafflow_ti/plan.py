@@ -69,6 +69,11 @@ class Plan:
         return sampling.axis(axis).radius + (self.ranges.reach(sampling, axis) if self.ranges else 0)
 
     @property
+    def time_offset(self) -> float:
+        """Where results lie between their frame and the next one, as a share of the step: 0, or half way."""
+        return 0.0 if self.problem.sampling.t.taps % 2 else 0.5
+
+    @property
     def bands(self) -> int:
         """Units per frame."""
         return -(-len(self.y) // self.band_rows)
@@ -202,7 +207,8 @@ class Plan:
             f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
             f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
             f"{self.preshift[0]},{self.preshift[1]} px per step",
-            f"frames      {self.frames[0]}..{self.frames[-1]} ({len(self.frames)})",
+            f"frames      {self.frames[0]}..{self.frames[-1]} ({len(self.frames)})"
+            + (", results half way to the next frame" if self.time_offset else ""),
             f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.x.step}: "
             f"{', '.join(self.names)}",
             f"units       {self.n_units}: {self.bands} bands of up to {self.band_rows} rows per frame",

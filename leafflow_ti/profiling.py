@@ -254,7 +254,7 @@ def _run_units(pipeline: Pipeline, band: int, frames: int) -> float:
     wanted = {plan.unit(t, band).index for t in range(frames)}
     last: list[Result] = []
     with tempfile.TemporaryDirectory(prefix="leafflow-ti-profile-") as folder:
-        store = create_store(Path(folder) / "out.zarr", plan, {})
+        store = create_store(Path(folder) / "out.zarr", plan, {}, pipeline.capture)
 
         def write(result: Result) -> None:
             last[:] = [result]

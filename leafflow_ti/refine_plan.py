@@ -161,7 +161,8 @@ def plan_refinement(
     motion, modes = 0, 0
     if temporal is not None:
         # A point that turns accelerates by ω²R: without A among the unknowns it is the velocity that errs.
-        motion = 3 if model.motion == "translation" else 9
+        # Two frames do not show it, nor does it move their difference.
+        motion = 3 if model.motion == "translation" else 6 if len(temporal) == 2 else 9
         modes = {"none": 0, "strain": 3}.get(model.deformation, 1)
     curved = model.brightness != "none" and model.brightness_terms in ("space", "both")
     terms = 6 if curved else _TERMS[model.brightness]
