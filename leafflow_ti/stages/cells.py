@@ -85,7 +85,7 @@ class Cells:
                     others = math.prod(sampling.axis(a).moment(e[AXES.index(a)]) for a in ("sx", "sy", "t"))
                     if (p.channel, p.vector) == (q.channel, q.vector) and others:
                         monomial = self.monomials.setdefault((e[_X], e[_Y]), len(self.monomials))
-                        factor = p.factor * q.factor * channel_noise(sampling, columns, p.channel) * others
+                        factor = p.factor * q.factor * channel_noise(sampling, columns, p.channel, tuple(e)) * others
                         found[r, c, monomial] = found.get((r, c, monomial), 0.0) + factor
         return [(*term, factor) for term, factor in found.items()]
 
