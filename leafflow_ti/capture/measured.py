@@ -19,12 +19,12 @@ from leafflow_ti.errors import ConfigError
 Array = npt.NDArray[np.float64]
 _Key = TypeVar("_Key", int, tuple[int, int])
 
-TAPS = 12
+TAPS = 14
 """Of the interpolation of images that are read at fractions of a pixel."""
 REACH = TAPS // 2
 """Pixels that it looks at on each side, at most."""
-_BAND = 0.75 * np.pi
-"""Frequency [rad/px] up to which it is exact: what lies above, the derivative filters suppress."""
+_BAND = 0.65 * np.pi
+"""Frequency [rad/px] up to which it is exact (to 2e-4): what lies above, the derivative filters suppress."""
 LEAST_FRACTION = 1e-6
 """Fraction of a pixel below which nothing is interpolated."""
 
