@@ -5,7 +5,7 @@ number of taps (for time) those at the offsets 1/2, 3/2: what they measure lies 
 are renormalised so that ``sum r D_r = 1`` and ``sum B = 1`` hold exactly. The four digits printed for 7 taps cannot
 be all right (they sum to 0.9995 and 1.0004); renormalised they differentiate with a gain error of 1.8e-3 at 1.8
 rad/px. The ones here, within 1.2e-4 of the printed, minimise the largest gain error up to there: 1e-5. Longer sets do
-so further, without a print to stay near: 9 taps 2.4e-7 up to 2.4 rad/px, 11 taps 6e-8 up to 2.6; 4 taps 1.6e-5 up to 1.
+so further, without a print to stay near: 9 taps 2.4e-7 up to 2.4 rad/px, 11 taps 1e-6 up to 2.6; 4 taps 1.6e-5 up to 1.
 """
 
 from __future__ import annotations
