@@ -40,9 +40,8 @@ HOLD = 1e-3
 
 
 def is_even(positions: Array) -> bool:
-    """Whether positions are equally far apart."""
-    nominal = np.linspace(positions[0], positions[-1], len(positions))
-    return bool(np.all(np.abs(positions - nominal) <= SAME))
+    """Whether positions are one nominal step apart."""
+    return bool(np.all(np.abs(positions - positions[0] - np.arange(len(positions))) <= SAME))
 
 
 def adapted(filters: FilterSet, positions: Array) -> tuple[Array, Array]:

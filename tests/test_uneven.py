@@ -15,8 +15,10 @@ from reference.measured import MeasuredScene, off_by
 from test_kernels_estimate import assert_maps_equal
 
 import leafflow_ti as lf
+from leafflow_ti.capture import capture_from_array
 from leafflow_ti.filters import FILTER_SETS, HALFWAY_SETS, filter_set
-from leafflow_ti.models import MODELS
+from leafflow_ti.models import MODELS, column_set
+from leafflow_ti.sampling import AxisSampling
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import render, truth
 from leafflow_ti.uneven import UnevenGrid, UnevenSampling, adapted, tilted_weights
@@ -169,6 +171,23 @@ def test_stages_agree_with_the_twin(
         assert found.map(name)[1][0, 0] == pytest.approx(std, rel=1e-4), name
 
 
+@pytest.mark.parametrize(("taps", "size"), [("2", 1), ("2", 3), ("4", 3)])
+@pytest.mark.parametrize("irregular", [False, True])
+def test_results_between_frames_agree_with_the_twin(
+    bench: Callable[..., conftest.Bench], taps: str, size: int, irregular: bool
+) -> None:
+    """An even number of taps along time: there are more frames behind the reference frame than before it."""
+    even = bench("affine-4d", "none", "line-x", "f64")
+    t = AxisSampling.gaussian(filter_set(taps), size, 1.0)
+    if irregular:
+        t = UnevenSampling.of_frames(filter_set(taps), size, 1.0, TIMES, t.before)
+    sampling = replace(even.sampling, t=t)
+    columns = column_set(MODELS["affine-4d"], "none", sampling.camera_axes, sampling.sampled)
+    images = even.images[: t.before + 1 + t.after]
+    b = replace(even, images=images, sampling=sampling, columns=columns)
+    assert_maps_equal(b, b.estimate("translation"))
+
+
 # Whole measurements
 
 
@@ -234,6 +253,21 @@ def test_velocity_is_unbiased_where_stamps_are_irregular(model: str, options: di
     if model == "affine-4d":
         _, velocity = errors(scene, 3, stamps=False, **chosen)
         assert np.abs(velocity[:2]).min() > 5e-3
+
+
+def test_results_count_in_the_stated_interval() -> None:
+    """Frames every 10 s and an interval of 20 s: velocities are twice as large per frame."""
+    scene = replace(SCENE, n_cols=5)
+    images, options = images_of(scene), {**OPTIONS, "model": "affine-4d", "stride": 16}
+    stamps = [10.0 * t for t in range(5)]
+    one, two = (
+        lf.estimate(capture_from_array(images, scene.geometry, interval, stamps_s=stamps), 2, **options)
+        for interval in (10.0, 20.0)
+    )
+    good = (one.status == Status.OK) & (two.status == Status.OK)
+    assert good.any()
+    # A window of 1 nominal step is two frames then, so that values agree as estimates do, not bit for bit.
+    assert np.allclose(two["velocity_x"][good], 2 * one["velocity_x"][good], rtol=2e-3)
 
 
 def test_sliding_over_irregular_frames_equals_single_ones(tmp_path: Any) -> None:
