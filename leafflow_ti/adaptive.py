@@ -128,17 +128,22 @@ class Adaptive:
         """The engine at a tile, aimed at the first of some labels, to see their surface alone."""
         pipeline, aims = self.pipeline, [surfaces.aims[label] for label in group]
         return pipeline.stays.move(
-            pipeline.engine(self._band), self._band, (tile.x[0], tile.y[0]), aims[0], frame,
-            partial(surfaces.layer, aims), partial(surfaces.hidden, aims[0], frame),
+            pipeline.engine(self._band), self._band, (tile.x[0], tile.y[0]), aims[0], self._frames(frame).start, frame,
+            partial(surfaces.layer, aims), partial(surfaces.hidden, aims[0]),
         )  # fmt: skip
 
-    def _frames(self, stay: Stay, each: Callable[[int, NDArray[np.float32], Mask], None]) -> None:
-        """All frames of the window of a stay, in turn."""
-        latency = stay.engine.tensor.latency
-        frames = range(stay.frame - latency, stay.frame + latency + 1)
+    def _frames(self, frame: int) -> range:
+        """Those that a measurement needs."""
+        t = self.plan.problem.sampling.t
+        return range(frame - t.before, frame + t.after + 1)
+
+    def _feed(self, stay: Stay, each: Callable[[int, NDArray[np.float32], Mask], None]) -> None:
+        """All frames of the window of a stay, in turn; its engine then speaks of their middle."""
+        frames = self._frames(stay.frame)
         with contextlib.closing(self.pipeline.reader.blocks(frames, stay.box, stay.aim, stay.frame)) as blocks:
             for t in frames:
                 each(t, *next(blocks))
+        stay.engine.set_frame(stay.frame)
 
     def _pass(self, tile: _Tile, surfaces: Surfaces, label: int, frame: int) -> tuple[Maps, Codes]:
         """Maps and status of a tile as one label sees them."""
@@ -152,7 +157,7 @@ class Adaptive:
             if t == frame:
                 samples.append(without_images(sample))
 
-        self._frames(stay, push)
+        self._feed(stay, push)
         self.pipeline.device.synchronize()
         maps, status = stays.maps(stay, tensors, samples[0])
         inner = (slice(0, len(tile.y)), slice(0, len(tile.x)))
@@ -210,7 +215,7 @@ class Adaptive:
         pixels without values, from their neighbours."""
         plan = self.plan
         stay = self._stay(tile, surfaces, group, frame)
-        self._frames(stay, partial(self.pipeline.stays.refine_alone, stay))
+        self._feed(stay, partial(self.pipeline.stays.refine_alone, stay))
         assert stay.engine.refine is not None
         assert plan.refine is not None
         part = {name: values[tile.place].copy() for name, values in maps.items()}

@@ -13,8 +13,3 @@ class Aim(NamedTuple):
 
     shift: tuple[int, int]
     motion: tuple[int, int] = (0, 0)
-
-    def offset(self, frames: int, steps: tuple[int, int] = (0, 0)) -> tuple[int, int]:
-        """Pixels (x, y) of an image so many frames and camera steps (x, y) from the reference."""
-        x, y = (s * k + m * frames for s, k, m in zip(self.shift, steps, self.motion, strict=True))
-        return x, y

@@ -151,16 +151,21 @@ def _open_store(
                     f"{out} cannot be resumed: its {key} differs from this run's; use --overwrite, or another output"
                 )
         return store
-    return create_store(out, plan, provenance, capture.frame_interval_s, overwrite)
+    return create_store(out, plan, provenance, capture, overwrite)
 
 
 def create_store(
-    out: Path, plan: Plan, attrs: dict[str, Any], interval_s: float | None = None, overwrite: bool = False
+    out: Path, plan: Plan, attrs: dict[str, Any], capture: Capture, overwrite: bool = False
 ) -> ResultStore:
     """An empty results store for a plan; errors as of ``ResultStore.create``."""
+    stamps, times = capture.stamps_s, None
+    if stamps is not None:
+        end = len(stamps) - 1
+        times = [stamps[t] + plan.time_offset * (stamps[min(t + 1, end)] - stamps[t]) for t in plan.frames]
     return ResultStore.create(
         out, frames=plan.frames, y=np.array(plan.y), x=np.array(plan.x), names=plan.names,
-        chunk=(1, plan.band_rows, len(plan.x)), attrs=attrs, interval_s=interval_s, overwrite=overwrite,
+        chunk=(1, plan.band_rows, len(plan.x)), attrs=attrs, interval_s=capture.frame_interval_s,
+        time_offset=plan.time_offset, times_s=times, overwrite=overwrite,
     )  # fmt: skip
 
 
@@ -189,7 +194,7 @@ def _provenance(plan: Plan, capture: Capture, device: Device, contents: bool = T
         "plan": {
             "model": plan.model, "preshift_px": list(plan.preshift), "bands": plan.bands,
             "f_px": g.f_px, "principal_px": list(g.principal_px), "baseline_mm": list(g.baseline_mm),
-            "disparity_offset_px": list(g.disparity_offset_px),
+            "disparity_offset_px": list(g.disparity_offset_px), "time_offset": plan.time_offset,
         },
         "leafflow_ti_version": __version__,
         "versions": {"python": platform.python_version()} | {p: installed(p) for p in ("taichi", "numpy", "zarr")},

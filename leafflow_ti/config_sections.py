@@ -50,6 +50,7 @@ Auto = Literal["auto"]
 Preshift = Literal["auto", "uniform", "adaptive"]
 _Taps = Annotated[Literal["3x1x1", "3", "5", "7"], BeforeValidator(str)]
 _AutoTaps = Annotated[Literal["auto", "3x1x1", "3", "5", "7"], BeforeValidator(str)]
+_TimeTaps = Annotated[Literal["auto", "2", "3x1x1", "3", "4", "5", "7", "9", "11"], BeforeValidator(str)]
 _AutoOdd = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 1, odd=True))]
 _AutoCount = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 1))]
 _AutoSteps = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 0, high=50))]
@@ -138,15 +139,18 @@ class FiltersSection(Section):
 
     ``blur``: the filters along x and y are convolved with a Gaussian of so many pixels. Texture that moves by more than
     half its wavelength per frame is aliased along time; with 1 px, 5 px/frame are measured that 7 taps alone miss.
+    ``blur_time``: those along time with one of so many frames, for less noise where motion is slow and steady.
+    ``taps_time`` 2 and 4, and "auto" with two frames: results lie half way between a frame and the next.
 
     ``prefilter`` of every image, with a Gaussian of ``sigma_pre`` pixels. On the cube under a spotlight, 8 are the best
     of 2 to 32: below, texture is lost; above, the light is left, and the dark beside the cube comes in.
     """
 
     taps: _Taps = "5"
-    taps_time: _AutoTaps = "auto"
+    taps_time: _TimeTaps = "auto"
     taps_camera: _AutoTaps = "auto"
     blur: Annotated[float, Field(ge=0, le=MAX_BLUR, allow_inf_nan=False)] = 0.0
+    blur_time: Annotated[float, Field(ge=0, le=MAX_BLUR, allow_inf_nan=False)] = 0.0
     prefilter: Prefilter = "none"
     sigma_pre: _Width = 8.0
 

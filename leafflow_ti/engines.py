@@ -66,11 +66,18 @@ class Engine:
         estimate = EstimateStage(device, problem, plan.layout, first, plan.differences, apart, tensor.sources)
         return cls(key, prefilter, tensor, estimate, ranges, refine, widening)
 
-    def reset(self) -> None:
-        """Forget all frames."""
-        self.tensor.reset()
+    def reset(self, first: int = 0) -> None:
+        """Forget all frames; the next one pushed is the frame ``first``."""
+        self.tensor.reset(first)
         if self.refine:
             self.refine.reset()
+
+    def set_frame(self, frame: int) -> None:
+        """Go on to the reference ``frame``: where frames are uneven, each has tables of its own."""
+        self.estimate.set_frame(frame)
+        t = self.estimate.problem.sampling.t
+        if self.refine and t.uneven:
+            self.refine.set_frames(tuple(t.positions.tolist()))
 
     def push(self, sample: Sample) -> Any | None:
         """Add a frame of every camera; the tensors once the windows are full."""

@@ -153,8 +153,9 @@ class Pipeline:
         if plan.adaptive:
             return slice(0, len(positions))  # what is left of a window decides, pass by pass
         reach = plan.reach(axis) if plan.config.window.border == "full" else 0
-        shifts = [plan.preshift[pair] * (k - self.capture.reference[1 - pair]) for k in plan.cameras[1 - pair]]
-        first, last = reach - min(shifts), size - 1 - reach - max(shifts)
+        read, cameras = self.capture.pixels_read(plan.preshift), list(plan.cameras[1 - pair])
+        lowest, highest = (n[cameras] for n in (read[2:] if pair == 0 else read[:2]))
+        first, last = reach - int(lowest.min()), size - 1 - reach - int(highest.max())
         inside = [i for i, p in enumerate(positions) if first <= p <= last]
         return slice(inside[0], inside[-1] + 1) if inside else slice(0, 0)
 
@@ -171,9 +172,9 @@ class Pipeline:
             for t_index in range(first, last + 1):
                 yield plan.unit(t_index, index), *self.cut(index, *self.framed(index))
             return
-        stay, aim = self._move(index), Aim(plan.preshift)
-        latency = stay.engine.tensor.latency
-        frames = range(plan.frames[first] - latency, plan.frames[last] + latency + 1)
+        latency, before = plan.problem.sampling.t.after, plan.problem.sampling.t.before
+        frames = range(plan.frames[first] - before, plan.frames[last] + latency + 1)
+        stay, aim = self._move(index, frames.start), Aim(plan.preshift)
         waiting: deque[Sample] = deque(maxlen=latency + 1)
         with contextlib.closing(self.reader.blocks(frames, stay.box, aim)) as blocks:
             for t in frames:
@@ -184,6 +185,7 @@ class Pipeline:
                     if tensors is None:
                         continue
                     self.device.synchronize()
+                    stay.engine.set_frame(t - latency)
                     maps, codes = self.framed(index, *self.stays.maps(stay, tensors, waiting[0]))
                     if stay.engine.refine and plan.refine:
                         y, x = self.around(index)
@@ -192,12 +194,12 @@ class Pipeline:
                     result = self.cut(index, maps, codes)
                 yield plan.unit(first + t - latency - plan.frames[first], index), *result
 
-    def _move(self, index: int) -> Stay:
-        """Bring an engine, all frames forgotten, to the measurable rectangle of a band."""
+    def _move(self, index: int, first: int = 0) -> Stay:
+        """Bring an engine, all frames forgotten, to the measurable rectangle of a band; ``first``: the next frame."""
         plan, (rows, cols) = self.plan, self.extent(index)
         band = Band.of(plan.problem.sampling, rows.stop - rows.start, cols.stop - cols.start, plan.x.step)
         at = self._x[cols.start], self._y[rows.start]
-        return self.stays.move(self.engine(band), band, at, Aim(plan.preshift))
+        return self.stays.move(self.engine(band), band, at, Aim(plan.preshift), first)
 
     def engine(self, band: Band) -> Engine:
         """The stages for a band of this size; those for the last one are kept."""

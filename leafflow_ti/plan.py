@@ -28,6 +28,7 @@ from leafflow_ti.models import MODELS, TensorLayout
 from leafflow_ti.noise import noise_level
 from leafflow_ti.range_plan import RangePlan, range_problem
 from leafflow_ti.refine_plan import Refinement, plan_refinement
+from leafflow_ti.sampling import AxisSampling
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, Problem
 
@@ -82,6 +83,11 @@ class Plan:
         """Pixels that a measurement needs on each side along an image axis."""
         sampling = self.problem.sampling
         return sampling.axis(axis).radius + (self.ranges.reach(sampling, axis) if self.ranges else 0)
+
+    @property
+    def time_offset(self) -> float:
+        """Where results lie between their frame and the next one, as a share of the step: 0, or half way."""
+        return 0.0 if self.problem.sampling.t.taps % 2 else 0.5
 
     @property
     def bands(self) -> int:
@@ -187,7 +193,8 @@ class Plan:
 
         def axis(name: str) -> str:
             plan = sampling.axis(name)
-            taps = f"{len(plan.filters.smooth)} taps" if plan.filters else "no filter"
+            taps = f"{plan.taps} taps" if plan.filters else "no filter"
+            taps += ", at measured places" if plan.uneven or (name in ("sx", "sy") and sampling.grid) else ""
             blocks = f" in {len(plan.blocks.weights)} blocks of {plan.blocks.step}" if plan.blocks else ""
             return f"{name}: {taps}, window of {plan.size}{blocks}"
 
@@ -223,7 +230,8 @@ class Plan:
             f"noise       {self.noise:.3g} {unit}, {'given' if known else 'estimated'}",
             f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
             f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, {self._shifts()}",
-            f"frames      {self.frames[0]}..{self.frames[-1]} ({len(self.frames)})",
+            f"frames      {self.frames[0]}..{self.frames[-1]} ({len(self.frames)})"
+            + (", results half way to the next frame" if self.time_offset else ""),
             f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.x.step}: "
             f"{', '.join(self.names)}",
             f"units       {self.n_units}: {self.bands} bands of up to {self.band_rows} rows per frame",
@@ -270,11 +278,11 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         own = replace(depth, noise=noise) if depth else None
         preshift = _uniform(capture, config) if own else (0, 0)
         alone = sampling_of(capture, config, "reference", True)
-        frames = _frames(capture, config, alone.t.radius, True)
+        frames = _frames(capture, config, alone.t)
         problem, ranges = range_problem(capture, config, alone, frames, own, preshift, noise)
     else:
         problem = model_problem(capture, config, name, motion)
-        frames = _frames(capture, config, problem.sampling.t.radius, model.time)
+        frames = _frames(capture, config, problem.sampling.t if model.time else None)
         preshift, adaptive = _preshift(capture, config, bool(problem.camera_axes), model.time)
     problem = replace(problem, noise=noise)
     layout = TensorLayout.of(problem.columns)
@@ -287,11 +295,11 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     x, y = range(x0, x1, stride), range(y0, y1, stride)
     grid = (ranges.depth if ranges and ranges.depth else problem).sampling
     cameras = cameras_read(grid, problem.own_flows, *capture.reference)
-    row, col = capture.reference
+    steps_x, steps_y = capture.camera_steps
     refine = plan_refinement(
         config,
-        range(-problem.sampling.t.radius, problem.sampling.t.radius + 1) if model.time else None,
-        [(sx - col, sy - row) for sy in cameras[0] for sx in cameras[1]],
+        _farthest(problem.sampling.t, frames) if model.time else None,
+        [(float(steps_x[sy, sx]), float(steps_y[sy, sx])) for sy in cameras[0] for sx in cameras[1]],
         (capture.height, capture.width),
     )
     plan = Plan(
@@ -314,17 +322,27 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     return replace(plan, bytes=memory + cache, cache_bytes=cache)
 
 
-def _frames(capture: Capture, config: RunConfig, radius: int, has_time: bool) -> tuple[int, ...]:
+def _frames(capture: Capture, config: RunConfig, time: AxisSampling | None) -> tuple[int, ...]:
+    """Frames that are measured; ``time``: the sampling along time, None without."""
     wanted = config.output.frame_range(capture.n_frames)
-    if not has_time:
+    if time is None:
         return tuple(wanted)
-    frames = tuple(t for t in wanted if radius <= t < capture.n_frames - radius)
+    first, end = time.before, capture.n_frames - time.after
+    frames = tuple(t for t in wanted if first <= t < end)
     if not frames:
         raise ConfigError(
-            f"output.frames = {config.output.frames!r}: the temporal window reaches {radius} frames to each side, "
-            f"so frames {radius}:{capture.n_frames - radius} can be measured"
+            f"output.frames = {config.output.frames!r}: the temporal window reaches from {time.before} frames before "
+            f"to {time.after} behind, so frames {first}:{end} can be measured"
         )
     return frames
+
+
+def _farthest(time: AxisSampling, frames: tuple[int, ...]) -> tuple[float, ...]:
+    """Offsets of the frames of a window; where they differ from one reference to the next, the farthest."""
+    if not time.uneven:
+        return tuple(time.positions.tolist())
+    found = (tuple(time.about(t).positions.tolist()) for t in frames)
+    return max(found, key=lambda offsets: max(map(abs, offsets)))
 
 
 def _geometry(capture: Capture) -> Geometry:

@@ -164,15 +164,15 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
         raise ConfigError("no pixel can be measured: the window reaches beyond the images everywhere: make it smaller")
     compiling = pipeline.warm_up()
     least = pipeline.least_seconds()
-    latency = plan.problem.sampling.t.radius
-    last = plan.frames[-1] + latency + 1
-    alone = range(max(plan.frames[0] - latency, last - ALONE_FRAMES), last)
+    t = plan.problem.sampling.t
+    last = plan.frames[-1] + t.after + 1
+    alone = range(max(plan.frames[0] - t.before, last - ALONE_FRAMES), last)
     background = {s: n / len(alone) for s, n in pipeline.read_alone(band, alone).items()}
     measured = min(frames, len(plan.frames))
     background["write"] = _run_units(pipeline, band, measured)
     if trace_file is not None:
         trace.write(trace_file)
-    steps = _Steps.of(trace.events or [], 2 * latency)
+    steps = _Steps.of(trace.events or [], t.before + t.after)
     seconds = statistics.median(steps.units)
     pixels = (plan.band(band).stop - plan.band(band).start) * len(plan.x)
     ceilings = measure_ceilings(device)
@@ -224,7 +224,7 @@ def predict(
     ``fill``, ``unit``: seconds of the two, waiting included; ``stages``: of a unit. Filling and filters grow with the
     rows of images, the rest with the rows of output that are computed; a band that is all border costs nothing.
     """
-    plan, latency = pipeline.plan, pipeline.plan.problem.sampling.t.radius
+    plan, t = pipeline.plan, pipeline.plan.problem.sampling.t
     filters = sum(stages.get(s, 0.0) for s in ("prefilter", "filter", "splines"))
     n = len(plan.frames)
     seconds, read = compiling, 0
@@ -234,7 +234,7 @@ def predict(
         if rows:
             wide = _image_rows(plan.problem.sampling, rows, plan) / _image_rows(plan.problem.sampling, high, plan)
             seconds += wide * (fill + n * filters) + n * (unit - filters) * rows / high
-            read += n + 2 * latency
+            read += n + t.before + t.after
     return Prediction(n, plan.bands, plan.n_units, read, seconds)
 
 
@@ -255,7 +255,7 @@ def _run_units(pipeline: Pipeline, band: int, frames: int) -> float:
     wanted = {plan.unit(t, band).index for t in range(frames)}
     last: list[Result] = []
     with tempfile.TemporaryDirectory(prefix="leafflow-ti-profile-") as folder:
-        store = create_store(Path(folder) / "out.zarr", plan, {})
+        store = create_store(Path(folder) / "out.zarr", plan, {}, pipeline.capture)
 
         def write(result: Result) -> None:
             last[:] = [result]

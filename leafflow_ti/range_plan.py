@@ -100,8 +100,8 @@ def range_problem(
     given = None
     if depth is None:
         assert chosen.depth is not None
-        radius = sampling.t.radius
-        given = open_range(chosen.depth, capture, range(frames[0] - radius, frames[-1] + radius + 1))
+        t = sampling.t
+        given = open_range(chosen.depth, capture, range(frames[0] - t.before, frames[-1] + t.after + 1))
         seen = given.frame(given.middle)[0]
         if not np.isfinite(seen).any():
             raise InputError(f"{given.path}: no depth at all in frame {given.middle}: give maps that have some")

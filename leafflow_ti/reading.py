@@ -15,6 +15,7 @@ from leafflow_ti.aim import Aim
 from leafflow_ti.background import prepared
 from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import read_gray
+from leafflow_ti.capture.measured import LEAST_FRACTION, REACH
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.plan import Plan
 from leafflow_ti.trace import span
@@ -66,7 +67,7 @@ class Reader:
     ) -> tuple[tuple[NDArray[Any], Mask], list[Callable[[], None]]]:
         """An empty block of one frame, and the work that fills it."""
         sy, sx = self.plan.cameras
-        x, y = aim.offset(t - around)
+        x, y = self.offset(aim, t, around)
         block = np.zeros((len(sy), len(sx), box.rows, box.cols), self.dtype)
         finite = np.ones(block.shape, bool)
         fills = self.capture.fills(block[None], [t], sy, sx, box.y + y, box.x + x, aim.shift)
@@ -77,21 +78,39 @@ class Reader:
         ]
         return (block, finite), pieces
 
-    def seen(self, box: Box, aim: Aim, frames: int = 0) -> tuple[Mask, Mask]:
-        """Which rows [cameras along y, rows] and columns [cameras along x, cols] of a block lie inside the images.
+    def elapsed(self, t: int, around: int) -> float:
+        """Frames from the results of frame ``around`` to frame ``t``."""
+        times = self.capture.frame_times
+        here = times[around]
+        if self.plan.time_offset:
+            here += self.plan.time_offset * (times[around + 1] - here)
+        return times[t] - here
 
-        ``frames`` from the reference."""
-        capture, shift, offset = self.capture, aim.shift, aim.offset(frames)
-        rows, cols = (
-            np.array(cameras)[:, None] - n for cameras, n in zip(self.plan.cameras, capture.reference, strict=True)
-        )
-        in_y = box.y + offset[1] + np.arange(box.rows) + shift[1] * rows
-        in_x = box.x + offset[0] + np.arange(box.cols) + shift[0] * cols
-        return (in_y >= 0) & (in_y < capture.height), (in_x >= 0) & (in_x < capture.width)
+    def offset(self, aim: Aim, t: int, around: int) -> tuple[float, float]:
+        """Pixels (x, y) that ``aim`` moves the images of frame ``t`` by, beside what it does from camera to camera."""
+        if aim.motion == (0, 0):
+            return 0.0, 0.0
+        frames = self.elapsed(t, around)
+        return aim.motion[0] * frames, aim.motion[1] * frames
 
-    def inside(self, box: Box, aim: Aim, frames: int = 0) -> Mask:
+    def seen(self, box: Box, aim: Aim, t: int = 0, around: int = 0) -> tuple[Mask, Mask]:
+        """Which rows [cameras along y, rows] and columns [cameras along x, cols] of a block lie inside the images of
+        frame ``t``, ``around`` which ``aim`` counts time."""
+        capture, found = self.capture, []
+        read, moved = capture.pixels_read(aim.shift), self.offset(aim, t, around)
+        for axis, (first, count, size) in enumerate(
+            ((box.y, box.rows, capture.height), (box.x, box.cols, capture.width))
+        ):
+            some = list(self.plan.cameras[axis])
+            whole, margin = _reached(moved[1 - axis])
+            low, high = (n[some][:, None] for n in read[2 * axis : 2 * axis + 2])
+            at = first + whole + np.arange(count)
+            found.append((at + low - margin >= 0) & (at + high + margin < size))
+        return found[0], found[1]
+
+    def inside(self, box: Box, aim: Aim, t: int = 0, around: int = 0) -> Mask:
         """Where every camera sees its image and the mask allows a measurement: [rows, cols]."""
-        in_y, in_x = (np.logical_and.reduce(seen) for seen in self.seen(box, aim, frames))
+        in_y, in_x = (np.logical_and.reduce(seen) for seen in self.seen(box, aim, t, around))
         inside = in_y[:, None] & in_x
         kept = self.masked(box)
         return np.asarray(inside if kept is None else inside & kept)
@@ -110,13 +129,19 @@ class Reader:
             return
         j, k, row, col = (int(n) for n in np.argwhere(wrong)[0])
         sy, sx = self.plan.cameras[0][j], self.plan.cameras[1][k]
-        shift = aim.offset(t - around, (sx - self.capture.reference[1], sy - self.capture.reference[0]))
-        x, y = box.x + col + shift[0], box.y + row + shift[1]
+        moved, (down, across) = self.offset(aim, t, around), self.capture.shifts(aim.shift)
+        x, y = round(box.x + col + moved[0] + across[sy, sx]), round(box.y + row + moved[1] + down[sy, sx])
         raise InputError(
             f"{self.capture.image_name(t, sy, sx)}: grey value {block[j, k, row, col]:g} at pixel x = {x}, y = {y}: "
             "prefilter homomorphic takes logarithms and needs values above 0: choose prefilter highpass, or add an "
             "offset to the images"
         )
+
+
+def _reached(moved: float) -> tuple[int, int]:
+    """The whole pixels of a move, and how far beyond them interpolation reaches."""
+    whole = round(moved)
+    return whole, REACH if abs(moved - whole) > LEAST_FRACTION else 0
 
 
 def _fill(whole: bool, fill: Callable[[], None], image: NDArray[Any], finite: Mask) -> None:

@@ -32,10 +32,11 @@ class Refinement:
     """At most ``steps`` Gauss-Newton steps on the exact moving patch.
 
     ``size``, ``sigma``: Gaussian window [px], of which every ``thin``-th pixel around the centre is a sample.
-    ``frames``: times from the reference frame, in frames, of any spacing; ``cameras``: (x, y) steps from the reference
-    camera, in the order of a block's images (rows, then columns). Unknowns are depth and slopes (Z0, ZX, ZY);
-    ``motion``: how many of (N, Ω, A): 0, 3, 6 or 9; ``modes`` of the deformation in the patch's plane: 0, 1 (growth
-    alike in all directions), 3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6. ``degree``
+    ``frames``: offsets from where the results lie in time, in frames, of any spacing; where frames are uneven, each
+    reference frame has its own, and these are the farthest. ``cameras``: (x, y) steps from the reference camera, in
+    the order of a block's images (rows, then columns). Unknowns are depth and slopes (Z0, ZX, ZY); ``motion``: how
+    many of (N, Ω, A): 0, 3, 6 or 9; ``modes`` of the deformation in the patch's plane: 0, 1 (growth alike in all
+    directions), 3 (strain rates). ``terms``: photometric terms of each image, 0, 1, 3 or 6. ``degree``
     of the splines, 5 or 7.
 
     ``flat``: one camera sees a plane that faces it and moves within itself. Depth and focal length are 1, so that its
@@ -47,7 +48,7 @@ class Refinement:
     sigma: float
     thin: int
     frames: tuple[float, ...]
-    cameras: tuple[tuple[int, int], ...]
+    cameras: tuple[tuple[float, float], ...]
     motion: int
     modes: int
     terms: int
@@ -79,7 +80,7 @@ class Refinement:
     def reach(self) -> int:
         """Pixels that a sample may lie from its place in the preshifted window."""
         steps = max(max(abs(x), abs(y)) for x, y in self.cameras)
-        return steps + math.ceil(2 * max(abs(t) for t in self.frames)) + 4
+        return math.ceil(steps + 2 * max(abs(t) for t in self.frames)) + 4
 
     @property
     def halo(self) -> int:
@@ -154,11 +155,14 @@ def samples_across(size: int, thin: int) -> int:
 
 
 def plan_refinement(
-    config: RunConfig, temporal: range | None, cameras: Iterable[tuple[int, int]], image: tuple[int, int]
+    config: RunConfig,
+    temporal: tuple[float, ...] | None,
+    cameras: Iterable[tuple[float, float]],
+    image: tuple[int, int],
 ) -> Refinement | None:
     """The refinement that a resolved configuration asks for; None: none.
 
-    ``temporal``: frame offsets under filters and window of the model, None if it is static; ``cameras``: as of
+    ``temporal``: offsets of the frames under filters and window of the model, None if it is static; ``cameras``: as of
     ``Refinement``, all that are read; ``image``: rows and columns. Raises ConfigError where they do not fit.
     """
     model, window, cameras = config.model, config.window, tuple(cameras)
@@ -199,12 +203,13 @@ def plan_refinement(
     motion, modes = 0, 0
     if temporal is not None:
         # A point that turns accelerates by ω²R: without A among the unknowns it is the velocity that errs.
-        motion = 3 if model.motion == "translation" else 9
+        # Two frames do not show it, nor does it move their difference.
+        motion = 3 if model.motion == "translation" else 6 if len(temporal) == 2 else 9
         modes = {"none": 0, "growth": 1, "strain": 3}.get(model.deformation, 3 if flat else 1)
     curved = model.brightness != "none" and model.brightness_terms in ("space", "both")
     terms = 6 if curved else _TERMS[model.brightness]
     sigma = window.sigma * size / window.size
-    frames = tuple(temporal or (0,))
+    frames = temporal or (0.0,)
     return Refinement(
         steps, size, sigma, thin, frames, cameras, motion, modes, terms, int(config.refine.spline), flat
     )  # fmt: skip

@@ -44,6 +44,8 @@ _COORDINATES: dict[str, dict[str, Any]] = {
     "x": {"long_name": "column in the reference image, to the right", "units": "px"},
 }
 
+_TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
+
 
 @dataclass(frozen=True, eq=False)
 class ResultStore:
@@ -70,12 +72,16 @@ class ResultStore:
         chunk: tuple[int, int, int],
         attrs: Mapping[str, Any],
         interval_s: float | None = None,
+        time_offset: float = 0.0,
+        times_s: Sequence[float] | None = None,
         overwrite: bool = False,
     ) -> Self:
         """A new store, every map preallocated with NaN and the status with ``NOT_COMPUTED``.
 
         ``y``, ``x``: pixel positions of the rows and columns; ``chunk``: ``(1, rows of a unit, len(x))``; ``attrs``:
-        JSON values; ``interval_s``: time between frames [s]. The store appears under its name only when it is whole.
+        JSON values; ``interval_s``: time between frames [s]; ``time_offset``: where results lie between their frame and
+        the next one, 0 to 1; ``times_s``: when that is, from measured stamps, kept as the coordinate ``time``. The
+        store appears under its name only when it is whole.
         Raises UsageError when ``path`` exists (``overwrite`` replaces a results store, nothing else), RunError when it
         cannot be written.
         """
@@ -96,7 +102,12 @@ class ResultStore:
                     attributes = dict(_COORDINATES[axis])
                     if axis == "t" and interval_s is not None:
                         attributes["interval_s"] = float(interval_s)
+                    if axis == "t" and time_offset:
+                        attributes["time_offset"] = float(time_offset)
                     group.create_array(axis, data=values, dimension_names=[axis], attributes=attributes)
+                if times_s is not None:
+                    times = np.asarray(times_s, np.float64)
+                    group.create_array("time", data=times, dimension_names=["t"], attributes=_TIME)
                 for name in (*names, "status"):
                     attributes = map_attributes(name)
                     if f"{name}_std" in names:

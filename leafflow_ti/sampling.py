@@ -3,95 +3,18 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.blocks import Blocks
 from leafflow_ti.filters import FilterSet, gaussian_weights
-from leafflow_ti.models import AXES, Column, ColumnSet
+from leafflow_ti.models import AXES, ONE, Column, ColumnSet
 
 Array = NDArray[np.float64]
-
-
-LEAST_BLOCKS = 9
-"""Blocks across a window: with fewer, its steps are so coarse that measured errors grow."""
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """Window weights that are constant on blocks of samples, so that sums over blocks serve every window.
-
-    Block b covers the samples ``b * step`` to ``b * step + length - 1`` with the weights ``weights[b] * shape``.
-    Blocks side by side share a sample where ``length`` is ``step + 1``; its ``shape`` is then ½ in both.
-    """
-
-    step: int
-    shape: tuple[float, ...]
-    weights: tuple[float, ...]
-
-    @property
-    def length(self) -> int:
-        """Samples of a block."""
-        return len(self.shape)
-
-    @property
-    def inner(self) -> Array:
-        """Offsets of a block's samples from its middle."""
-        return np.asarray(np.arange(self.length) - (self.length - 1) / 2, np.float64)
-
-    @property
-    def centres(self) -> Array:
-        """Offsets of the blocks' middles from that of the window."""
-        return np.asarray(self.step * (np.arange(len(self.weights)) - (len(self.weights) - 1) / 2), np.float64)
-
-    @classmethod
-    @functools.lru_cache(maxsize=64)
-    def of(cls, size: int, moment: float, stride: int) -> Blocks | None:
-        """Blocks for outputs at distance ``stride`` in place of a window of ``size`` samples; None: no such blocks.
-
-        ``step`` is the largest divisor of ``stride`` that leaves ``LEAST_BLOCKS`` across the window. Their number is
-        the one whose window is nearest to ``size`` in length (the shorter of two): within ``(step + 1) / 2`` samples.
-        Weights are those of a Gaussian at the middles of the blocks, its σ such that the second moment of the window
-        is ``moment``, or else as near to it as its length allows.
-        """
-        steps = [d for d in range(2, stride + 1) if stride % d == 0 and (size - 1) // d >= LEAST_BLOCKS]
-        if not steps:
-            return None
-        step = steps[-1]
-
-        def shape(n: int) -> tuple[float, ...]:
-            # An output lies at the middle of its window, which must be a sample: blocks share samples unless both
-            # their number and their length are odd.
-            return (1.0,) * step if n % 2 and step % 2 else (0.5, *(1.0,) * (step - 1), 0.5)
-
-        fewest = (size - 1) // step
-        n = min(range(fewest - 1, fewest + 2), key=lambda n: abs((n - 1) * step + len(shape(n)) - size))
-
-        def narrowed(q: float) -> Blocks:
-            w = np.exp(-q * cls(step, shape(n), (1.0,) * n).centres ** 2)
-            return cls(step, shape(n), tuple((w / (w.sum() * sum(shape(n)))).tolist()))
-
-        low, high = 0.0, 1.0
-        for _ in range(200):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if narrowed(middle).moment > moment else (low, middle)
-        return narrowed(low)
-
-    @property
-    def moment(self) -> float:
-        """``Σ w(Δ) Δ²``."""
-        offset = self.centres[:, None] + self.inner
-        return float(np.sum(np.outer(self.weights, self.shape) * offset**2))
-
-    @property
-    def samples(self) -> tuple[float, ...]:
-        """Weight of every sample of the window."""
-        found = np.zeros((len(self.weights) - 1) * self.step + self.length)
-        for b, weight in enumerate(self.weights):
-            found[b * self.step : b * self.step + self.length] += weight * np.array(self.shape)
-        return tuple(found.tolist())
 
 
 @dataclass(frozen=True)
@@ -126,6 +49,25 @@ class AxisSampling:
         return len(self.weights)
 
     @property
+    def uneven(self) -> bool:
+        """Whether kernels differ from sample to sample."""
+        return False
+
+    @property
+    def reference(self) -> int:
+        """Index of the reference sample, where that matters."""
+        return 0
+
+    def about(self, sample: int) -> AxisSampling:
+        """The same about another reference sample of the sequence."""
+        return self
+
+    @property
+    def taps(self) -> int:
+        """Samples under the filters."""
+        return self.filters.taps if self.filters else 1
+
+    @property
     def filter_radius(self) -> int:
         """Halo of the filters alone."""
         return self.filters.radius if self.filters else 0
@@ -135,20 +77,64 @@ class AxisSampling:
         """Halo of window and filters together: samples needed on each side of the centre."""
         return self.size // 2 + self.filter_radius
 
-    def kernel(self, differentiate: bool) -> Array:
-        """Filter kernel along this axis; the identity where there is a single sample."""
+    @property
+    def before(self) -> int:
+        """Samples needed before the reference sample; as many behind it (``after``) where the taps are odd."""
+        return self.size // 2 + (self.taps - 1) // 2
+
+    @property
+    def after(self) -> int:
+        """Samples needed behind the reference sample. With an even number of taps the results lie half a sample behind
+        it."""
+        return self.size // 2 + self.taps // 2
+
+    @property
+    def halfway(self) -> float:
+        """How far behind the reference sample the results lie, in samples: 0, or .5 with an even number of taps."""
+        return 0.0 if self.taps % 2 else 0.5
+
+    @property
+    def positions(self) -> Array:
+        """Of all samples that are needed, from where the results lie: [before + 1 + after], in nominal steps."""
+        return np.asarray(np.arange(-self.before, self.after + 1) - self.halfway, np.float64)
+
+    @property
+    def offsets(self) -> Array:
+        """Where the filtered samples of the window lie, from its centre, shape (size,)."""
+        return np.asarray(np.arange(self.size) - self.size // 2, np.float64)
+
+    def kernel(self, differentiate: bool, sample: int = 0) -> Array:
+        """Filter kernel of a sample, counted from the reference; the identity where there is a single sample."""
         if self.filters is None:
             return np.ones(1)
         return self.filters.kernel(differentiate)
 
     def window(self, power: int) -> Array:
         """Weights times the offset to ``power``: ``w(Δ) Δ^power``, shape (size,)."""
-        offset = np.arange(self.size) - self.size // 2
-        return np.asarray(np.array(self.weights) * offset.astype(float) ** power)
+        return np.asarray(np.array(self.weights) * self.offsets**power)
 
     def moment(self, power: int) -> float:
         """``Σ w(Δ) Δ^power``."""
         return float(self.window(power).sum())
+
+    def response(self, differentiate: bool, power: int) -> Array:
+        """Weights of the unfiltered samples in ``Σ w(Δ) Δ^power`` times the filtered ones, [size + taps - 1]."""
+        return np.asarray(np.convolve(self.window(power), self.kernel(differentiate)))
+
+    def gains(self, differentiate: bool) -> Array:
+        """Noise variance of each filtered sample per variance of the samples' noise, shape (size,)."""
+        return np.full(self.size, np.sum(self.kernel(differentiate) ** 2))
+
+    def gain(self, differentiate: bool, power: int = 0) -> float:
+        """The same, averaged over the window with the weights ``w(Δ) Δ^power``; 1, whose sum vanishes, as 0."""
+        return float(np.sum(self.kernel(differentiate) ** 2))
+
+
+class CameraGrid(Protocol):
+    """What knows the kernels of a camera grid that is no product of two axes."""
+
+    def kernel(self, names: tuple[str, str], row: int, col: int) -> Array:
+        """Kernel [taps along sy, taps along sx] of the sample (row, col), from the reference; names "d" or "b"."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +146,8 @@ class Sampling:
     sx: AxisSampling = AxisSampling()
     sy: AxisSampling = AxisSampling()
     t: AxisSampling = AxisSampling()
+    grid: CameraGrid | None = None
+    """Kernels of both camera axes together; None: they are products of one along each."""
 
     def axis(self, name: str) -> AxisSampling:
         """The sampling along one axis of ``AXES``."""
@@ -175,6 +163,10 @@ class Sampling:
     def sampled(self) -> dict[str, float]:
         """Axes along which the window holds more than one sample, and the second moment of its weights."""
         return {a: self.axis(a).moment(2) for a in AXES if self.axis(a).size > 1}
+
+    def about(self, frame: int) -> Sampling:
+        """The sampling about the reference frame ``frame``: another one where frames are uneven in time."""
+        return replace(self, t=self.t.about(frame)) if self.t.uneven else self
 
     def moment(self, exponents: tuple[int, ...]) -> float:
         """``Σ w(Δ) Δ^exponents`` over the whole window."""
@@ -192,14 +184,17 @@ def difference_variance(axis: AxisSampling, span: int, power: int = 0) -> float:
     return 2 * (1 - shared) / span**2
 
 
-def noise_gain(sampling: Sampling, channel: str) -> float:
-    """Variance of a channel per variance of the image noise: product of the squared filter norms (2.24)."""
-    return float(np.prod([np.sum(sampling.axis(a).kernel(a == channel) ** 2) for a in AXES]))
+def noise_gain(sampling: Sampling, channel: str, exponents: tuple[int, ...] = ONE) -> float:
+    """Variance of a channel per variance of the image noise: product of the squared filter norms (2.24).
+
+    Where samples are uneven it differs from one to the next; ``exponents``: averaged over ``w(Δ) Δ^exponents``.
+    """
+    return float(np.prod([sampling.axis(a).gain(a == channel, e) for a, e in zip(AXES, exponents, strict=True)]))
 
 
-def channel_noise(sampling: Sampling, columns: ColumnSet, channel: str) -> float:
+def channel_noise(sampling: Sampling, columns: ColumnSet, channel: str, exponents: tuple[int, ...] = ONE) -> float:
     """The same, also of channels that are made of several images."""
-    return columns.derived[channel].gain if channel in columns.derived else noise_gain(sampling, channel)
+    return columns.derived[channel].gain if channel in columns.derived else noise_gain(sampling, channel, exponents)
 
 
 def white_smoothness(sampling: Sampling) -> float:
@@ -216,18 +211,18 @@ def column_noise(sampling: Sampling, columns: ColumnSet) -> Array:
     """Diagonal of ``C = Σ w C_i``, the noise covariance of the columns summed over the window; shape (N,).
 
     For symmetric windows C is diagonal: the filters of different channels are orthogonal, odd moments vanish, and
-    squares are centred.
+    squares are centred. Of what uneven cameras or frames add, nothing counts: Ix, Iy and the time-like channels stay
+    orthogonal by their kernels along x and y, first moments vanish by the choice of the weights (see ``uneven``); only
+    I and a time-like channel share noise, and that is next to nothing beside the energy of I.
     """
 
     def of(column: Column) -> float:
-        return sum(
-            p.factor
-            * q.factor
-            * channel_noise(sampling, columns, p.channel)
-            * sampling.moment(_sum(p.exponents, q.exponents))
-            for p, q in product(column.terms, repeat=2)
-            if (p.channel, p.vector) == (q.channel, q.vector)
-        )
+        total = 0.0
+        for p, q in product(column.terms, repeat=2):
+            if (p.channel, p.vector) == (q.channel, q.vector):
+                e = _sum(p.exponents, q.exponents)
+                total += p.factor * q.factor * channel_noise(sampling, columns, p.channel, e) * sampling.moment(e)
+        return total
 
     return np.array([of(c) for c in columns.columns])
 
@@ -249,8 +244,7 @@ def _series_factor(axis: AxisSampling, differentiate: bool, m: int, n: int) -> f
     """Exact noise of a weighted sum of filtered samples along a camera or time axis, relative to the moment of w."""
     if (m + n) % 2:
         return 0.0
-    h = axis.kernel(differentiate)[::-1]
-    noise = np.dot(np.convolve(h, axis.window(m)), np.convolve(h, axis.window(n)))
+    noise = np.dot(axis.response(differentiate, m), axis.response(differentiate, n))
     return float(noise / axis.moment(m + n))
 
 
@@ -317,8 +311,7 @@ def cross_noise(sampling: Sampling, columns: ColumnSet, first: str, second: str)
     one, two = sampling.axis(first), sampling.axis(second)
 
     def series(axis: AxisSampling, derivative_power: int, smooth_power: int) -> float:
-        d, b = axis.kernel(True)[::-1], axis.kernel(False)[::-1]
-        return float(np.dot(np.convolve(d, axis.window(derivative_power)), np.convolve(b, axis.window(smooth_power))))
+        return float(np.dot(axis.response(True, derivative_power), axis.response(False, smooth_power)))
 
     value = series(one, 0, 1) * series(two, 0, 1) * _pixel_factor(sampling.x, 0, 0) * _pixel_factor(sampling.y, 0, 0)
     terms = []
@@ -342,7 +335,7 @@ def shared_noise(
     """
 
     def share(axis: AxisSampling, power: int, at: int) -> float:
-        seen = np.convolve(axis.kernel(False)[::-1], axis.window(power))
+        seen = axis.response(False, power)
         i = at + len(seen) // 2
         return float(seen[i]) if 0 <= i < len(seen) else 0.0
 

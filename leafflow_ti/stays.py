@@ -27,9 +27,9 @@ from leafflow_ti.trace import span
 Maps = dict[str, NDArray[Any]]
 Layer = Callable[[Box], Mask]
 """Of a block of the reference image, [rows, cols]: where the surface is that is measured."""
-Hidden = Callable[[int, Box], Mask | None]
-"""Of a frame and a block: [sy, sx, rows, cols], where an image shows something else than what is measured; None:
-nowhere."""
+Hidden = Callable[[float, Box], Mask | None]
+"""Of the time since the results [frames] and a block, [sy, sx, rows, cols]: where an image shows something else than
+what is measured; None: nowhere."""
 
 
 @dataclass(frozen=True)
@@ -71,22 +71,25 @@ class Stays:
     def view(self, at: tuple[int, int], band: Band, pitch: int, aim: Aim) -> View:
         """The output grid whose first pixel is the image's pixel (x, y) ``at``."""
         geometry = self.plan.geometry
-        offset = geometry.disparity_offset_px
+        offset, baseline = geometry.disparity_offset_px, geometry.baseline_mm
+        shift: tuple[float, float] = (aim.shift[0] + offset[0], aim.shift[1] + offset[1])
+        if self.reader.capture.positions_mm is not None:
+            shift, baseline = geometry.along_both(shift), geometry.along_both(baseline)
         return View(
-            geometry.f_px, geometry.principal_px, geometry.baseline_mm,
-            (aim.shift[0] + offset[0], aim.shift[1] + offset[1]), *at, self.plan.x.step, band.rows, band.cols, pitch,
+            geometry.f_px, geometry.principal_px, baseline, shift, *at, self.plan.x.step, band.rows, band.cols, pitch,
             (float(aim.motion[0]), float(aim.motion[1])),
         )  # fmt: skip
 
     def move(
-        self, engine: Engine, band: Band, at: tuple[int, int], aim: Aim, frame: int = 0, layer: Layer | None = None,
-        hidden: Hidden | None = None,
+        self, engine: Engine, band: Band, at: tuple[int, int], aim: Aim, first: int = 0, frame: int = 0,
+        layer: Layer | None = None, hidden: Hidden | None = None,
     ) -> Stay:  # fmt: skip
         """Bring an engine, all frames forgotten, to the output pixels of a band, the first of which is (x, y) ``at``.
 
-        ``layer``: where the surface is that is measured; None: everywhere. ``hidden``: see there.
+        ``first``: the next frame; ``frame``: from which ``aim`` counts time. ``layer``: where the surface is that is
+        measured; None: everywhere. ``hidden``: see there.
         """
-        engine.reset()
+        engine.reset(first)
         engine.estimate.set_view(self.view(at, band, engine.tensor.out_pitch, aim))
         if engine.refine:
             engine.refine.set_view(engine.estimate.view)
@@ -131,7 +134,7 @@ class Stays:
         engine = stay.engine
         if engine.prefilter:
             block, finite = self._prefiltered(stay, engine.prefilter, t, block, finite)
-        hidden = stay.hidden(t, stay.wide) if stay.hidden else None
+        hidden = stay.hidden(self.reader.elapsed(t, stay.frame), stay.wide) if stay.hidden else None
         if not engine.refine:
             return block, finite, hidden
         if refining:
@@ -141,7 +144,7 @@ class Stays:
 
     def _seen(self, box: Box, stay: Stay, t: int) -> Mask:
         """Where the pixels of a block lie inside the images of each camera, [sy, sx, rows, cols]."""
-        in_y, in_x = self.reader.seen(box, stay.aim, t - stay.frame)
+        in_y, in_x = self.reader.seen(box, stay.aim, t, stay.frame)
         return in_y[:, None, :, None] & in_x[None, :, None, :]
 
     def _sample(self, stay: Stay, t: int, block: NDArray[Any], finite: Mask, hidden: Mask | None) -> Sample:
@@ -149,7 +152,7 @@ class Stays:
         engine, allowed = stay.engine, stay.allowed
         everywhere = np.asarray(finite.all(axis=(0, 1)))
         if allowed is None:
-            allowed = self.reader.inside(stay.block, stay.aim, t - stay.frame)
+            allowed = self.reader.inside(stay.block, stay.aim, t, stay.frame)
             if stay.layer is not None:
                 allowed &= stay.layer[stay.inner]
             if hidden is not None:

@@ -81,8 +81,8 @@ class Surfaces:
         out[inner] = ~dilated(other, 1)
         return out[1:-1, 1:-1]
 
-    def hidden(self, aim: Aim, frame: int, t: int, box: Box) -> Mask | None:
-        """Where another surface hides a label's in the images of frame ``t``, [sy, sx, rows, cols]; None: nowhere.
+    def hidden(self, aim: Aim, elapsed: float, box: Box) -> Mask | None:
+        """Where another surface hides a label's, ``elapsed`` frames from the results: [sy, sx, rows, cols], or None.
 
         What is nearer hides; with one camera, which knows no depth, everything else that moves otherwise may.
         """
@@ -90,7 +90,7 @@ class Surfaces:
 
         least = REACH if not self._many else REACH + self._toward * aim.shift[self._axis]
         nearness = self._nearness if self._many else self._otherwise(aim)
-        views = np.array([(kx, ky, t - frame) for ky in self._steps[0] for kx in self._steps[1]], float).T
+        views = np.array([(kx, ky, elapsed) for ky in self._steps[0] for kx in self._steps[1]], float).T
         regions = self._regions(aim, views, box, nearness > least)
         if not (np.diff(regions[:, :2]) > 0).any():
             return None

@@ -170,6 +170,7 @@ class Bench:
     valid: np.ndarray | None = None  # [t, y, x]
     brightness: str = "none"
     brightness_terms: str = "none"
+    places: tuple[tuple[float, float], ...] = ()  # of the own flows' cameras, where these are no whole steps
 
     @cached_property
     def layout(self) -> TensorLayout:
@@ -302,7 +303,14 @@ class Bench:
                     assert not sources
                     tensors = self._chosen(kept, lost)
                 options["own_flows"] = OwnFlows(
-                    columns, sampling, tuple(self.steps[i] for i in kept), own, unknowns, model.reference_rows, growth
+                    columns,
+                    sampling,
+                    tuple(self.steps[i] for i in kept),
+                    own,
+                    unknowns,
+                    model.reference_rows,
+                    growth,
+                    tuple(self.places[i] for i in kept) if self.places else (),
                 )
         elif not self.sampling.camera_axes:
             options["offsets"] = flow_offsets(self.columns)

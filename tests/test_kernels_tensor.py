@@ -11,9 +11,10 @@ from reference import chain
 from scipy.ndimage import minimum_filter
 from tolerances import EXACT, tolerance
 
+from leafflow_ti.blocks import LEAST_BLOCKS
 from leafflow_ti.filters import FILTER_SETS, filter_set
 from leafflow_ti.models import AXES, MODELS, OWN_FLOW, TensorLayout, column_set, monomial
-from leafflow_ti.sampling import LEAST_BLOCKS, AxisSampling, Sampling
+from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.tensor import Band, Request, TensorStage, band_bytes
 
 PIXELS = ((0, 0), (1, 3), (2, 4))

@@ -25,6 +25,16 @@ from leafflow_ti.capture.channels import Array, Channel
 from leafflow_ti.capture.description import FILE_NAME, Description, read_description
 from leafflow_ti.capture.images import read_window
 from leafflow_ti.capture.layout import Layout, find_layout
+from leafflow_ti.capture.measured import (
+    LEAST_FRACTION,
+    REACH,
+    camera_positions,
+    interpolated,
+    nominal_interval,
+    stated_positions,
+    stated_stamps,
+    time_stamps,
+)
 from leafflow_ti.errors import ConfigError, InputError
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
@@ -43,6 +53,14 @@ class Geometry:
     principal_px: tuple[float, float]
     baseline_mm: tuple[float, float] = (0.0, 0.0)
     disparity_offset_px: tuple[float, float] = (0.0, 0.0)
+
+    def along_both(self, pair: tuple[float, float]) -> tuple[float, float]:
+        """What holds per camera step, with that of the other axis for an axis that has one camera and so no step.
+
+        A row's cameras that stand off along y are counted in its steps along x: a disparity is the same per mm.
+        """
+        x, y = pair
+        return (x if self.baseline_mm[0] else y, y if self.baseline_mm[1] else x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +84,10 @@ class Capture(ABC):
     description: Description | None = field(repr=False)
     path: Path | None
     """The ``capture.toml``, or None for an array."""
+    positions_mm: npt.NDArray[np.float64] | None = field(repr=False)
+    """Measured camera positions [rows, columns, (x, y)] relative to the reference camera; None: as ``baseline_mm``."""
+    stamps_s: tuple[float, ...] | None = field(repr=False)
+    """Measured time of each frame; None: one ``frame_interval_s`` after the other."""
 
     @property
     def reference(self) -> tuple[int, int]:
@@ -76,6 +98,53 @@ class Capture(ABC):
     def shape(self) -> tuple[int, int, int, int, int]:
         """``(n_frames, n_rows, n_cols, height, width)``."""
         return self.n_frames, self.n_rows, self.n_cols, self.height, self.width
+
+    @property
+    def camera_steps(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Where the cameras stand: x and y [rows, columns], in nominal steps from the reference."""
+        row0, col0 = self.reference
+        if self.positions_mm is None or self.geometry is None:
+            y, x = np.meshgrid(np.arange(self.n_rows) - row0, np.arange(self.n_cols) - col0, indexing="ij")
+            return x.astype(np.float64), y.astype(np.float64)
+        x_mm, y_mm = self.geometry.along_both(self.geometry.baseline_mm)
+        return self.positions_mm[..., 0] / x_mm, self.positions_mm[..., 1] / y_mm
+
+    @property
+    def frame_times(self) -> tuple[float, ...]:
+        """Time of each frame in nominal intervals from the first one."""
+        if self.stamps_s is None or self.frame_interval_s is None:
+            return tuple(float(t) for t in range(self.n_frames))
+        return tuple((s - self.stamps_s[0]) / self.frame_interval_s for s in self.stamps_s)
+
+    def shifts(self, shift_px: tuple[float, float]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """By how many pixels each camera's image is read shifted, y and x [rows, columns]; ``shift_px``: (x, y) per
+        nominal step. Where positions are measured they are no whole numbers."""
+        x, y = self.camera_steps
+        if self.positions_mm is not None and self.geometry is not None:
+            shift_px = self.geometry.along_both(shift_px)
+        return shift_px[1] * y, shift_px[0] * x
+
+    def pixels_read(
+        self, shift_px: tuple[float, float]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """What of its images a pixel at 0 is made of: first and last row for each camera row, first and last column
+        for each camera column; interpolation included."""
+        found = []
+        for shifts, across in zip(self.shifts(shift_px), (1, 0), strict=True):
+            near = np.round(shifts)
+            more = np.where(np.abs(shifts - near) > LEAST_FRACTION, REACH, 0)
+            found += [(near - more).min(axis=across), (near + more).max(axis=across)]
+        first_y, last_y, first_x, last_x = (f.astype(np.int64) for f in found)
+        return first_y, last_y, first_x, last_x
+
+    def _measured(self) -> dict[str, Any]:
+        """Measured positions and stamps for the fingerprint."""
+        found: dict[str, Any] = {}
+        if self.positions_mm is not None:
+            found["positions_mm"] = self.positions_mm.round(9).tolist()
+        if self.stamps_s is not None:
+            found["stamps_s"] = list(self.stamps_s)
+        return found
 
     @abstractmethod
     def _window(self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int) -> Array:
@@ -124,6 +193,8 @@ class Capture(ABC):
 
         With ``(nx, ny) = shift_px`` and a camera ``(kx, ky)`` steps from the reference, block pixel ``(x', y')`` is
         image pixel ``(x' + nx kx, y' + ny ky)``: the integer preshift nu0 of model section 1. Outside the images: 0.
+        Where positions are measured, k is the camera's true place in steps, and images are interpolated: what is left
+        of the disparity is then in proportion to it, like everything that filters along the cameras rely on.
         """
         out = np.zeros((len(frames), len(rows), len(cols), y1 - y0, x1 - x0), dtype)
         for fill in self.fills(out, frames, rows, cols, y0, x0, shift_px):
@@ -136,20 +207,31 @@ class Capture(ABC):
         frames: Sequence[int],
         rows: Sequence[int],
         cols: Sequence[int],
-        y0: int,
-        x0: int,
+        y0: float,
+        x0: float,
         shift_px: tuple[int, int] = (0, 0),
     ) -> Iterator[Callable[[], None]]:
         """The work of ``block``, image by image, for threads to share: each call fills its image of ``out``.
 
         ``out`` [t, sy, sx, rows, columns] is zero before; the order is that of its images.
         """
-        row0, col0 = self.reference
+        shift_y, shift_x = self.shifts(shift_px)
         for i, t in enumerate(frames):
             for j, sy in enumerate(rows):
                 for k, sx in enumerate(cols):
-                    top, left = y0 + shift_px[1] * (sy - row0), x0 + shift_px[0] * (sx - col0)
-                    yield partial(self._read_into, out[i, j, k], t, sy, sx, top, left)
+                    place = y0 + float(shift_y[sy, sx]), x0 + float(shift_x[sy, sx])
+                    yield partial(self._read_at, out[i, j, k], t, sy, sx, *place)
+
+    def _read_at(self, out: Array, t: int, sy: int, sx: int, top: float, left: float) -> None:
+        """The same as ``_read_into`` at a place between pixels."""
+        corner = math.floor(top + LEAST_FRACTION), math.floor(left + LEAST_FRACTION)
+        fraction = top - corner[0], left - corner[1]
+        if max(fraction) < LEAST_FRACTION:
+            self._read_into(out, t, sy, sx, *corner)
+            return
+        around = np.zeros([n + 2 * REACH for n in out.shape], out.dtype)
+        self._read_into(around, t, sy, sx, corner[0] - REACH, corner[1] - REACH)
+        out[...] = interpolated(around, fraction)
 
     def _read_into(self, out: Array, t: int, sy: int, sx: int, top: int, left: int) -> None:
         """Copy the part of a window that lies inside the image; ``out`` is zero before."""
@@ -217,6 +299,7 @@ class FileCapture(Capture):
             "files": len(self.layout.paths),
             "names_and_sizes_sha256": listing.hexdigest(),
             **({name: _sha256(path) for name, path in ends.items()} if contents else {}),
+            **self._measured(),
         }
 
 
@@ -235,7 +318,7 @@ class ArrayCapture(Capture):
         found: dict[str, Any] = {"shape": list(self.images.shape), "dtype": str(self.dtype)}
         if contents:
             found["sha256"] = hashlib.sha256(np.ascontiguousarray(self.images).data).hexdigest()
-        return found
+        return found | self._measured()
 
 
 def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> FileCapture:
@@ -252,6 +335,8 @@ def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Fi
     info = layout.info
     n_frames, n_rows, n_cols = layout.file.shape
     bits = description.images.bit_depth or info.bits
+    geometry = _geometry(path, description, n_rows, n_cols, info.height, info.width)
+    stamps, interval = stated_stamps(path, description, layout)
     return FileCapture(
         n_frames=n_frames,
         n_rows=n_rows,
@@ -260,11 +345,13 @@ def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Fi
         width=info.width,
         dtype=info.dtype,
         bits=bits,
-        geometry=_geometry(path, description, n_rows, n_cols, info.height, info.width),
-        frame_interval_s=description.time.interval_s if description.time else None,
+        geometry=geometry,
+        frame_interval_s=interval,
         frames=layout.values["t"],
         description=description,
         path=path,
+        positions_mm=stated_positions(path, description, layout, geometry.baseline_mm if geometry else None),
+        stamps_s=stamps,
         layout=layout,
         channel=description.images.channel,
         _cache=ImageCache(cache_bytes),
@@ -276,11 +363,15 @@ def capture_from_array(
     geometry: Geometry | None = None,
     frame_interval_s: float | None = None,
     bits: int | None = None,
+    positions_mm: npt.ArrayLike | None = None,
+    stamps_s: Sequence[float] | None = None,
 ) -> ArrayCapture:
     """A capture from grey images ``[t, sy, sx, y, x]``; the array is not copied.
 
-    ``bits`` defaults to those of its type. Raises InputError for another number of axes, an empty array, a type that is
-    not real, or several cameras without geometry.
+    ``bits`` defaults to those of its type. ``positions_mm`` [sy, sx, 2] or [sy sx, 2]: measured (x, y) of the cameras;
+    ``stamps_s`` [t]: measured time of the frames, of which ``frame_interval_s`` defaults to the median step. Raises
+    InputError for another number of axes, an empty array, a type that is not real, or several cameras without geometry,
+    ConfigError for positions or stamps that do not fit.
     """
     array = np.asarray(images)
     if array.ndim != 5 or array.size == 0:
@@ -290,6 +381,14 @@ def capture_from_array(
     n_frames, n_rows, n_cols, height, width = array.shape
     if geometry is None and n_rows * n_cols > 1:
         raise InputError(f"{n_rows} x {n_cols} cameras need a geometry: pass Geometry(f_px, principal_px, baseline_mm)")
+    positions = None
+    if positions_mm is not None:
+        positions = camera_positions(
+            positions_mm, (n_rows, n_cols), geometry.baseline_mm if geometry else None, "positions_mm"
+        )
+    stamps = None if stamps_s is None else time_stamps(stamps_s, n_frames, "stamps_s")
+    if stamps is not None:
+        frame_interval_s = frame_interval_s or nominal_interval(stamps)
     return ArrayCapture(
         n_frames=n_frames,
         n_rows=n_rows,
@@ -303,6 +402,8 @@ def capture_from_array(
         frames=tuple(range(n_frames)),
         description=None,
         path=None,
+        positions_mm=positions,
+        stamps_s=stamps,
         images=array,
     )
 

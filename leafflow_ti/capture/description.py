@@ -16,8 +16,12 @@
     [grid]
     baseline_mm = [5.0, 5.0]          # x, y step of the camera for each step of sx, sy; one number for a 1D grid
     disparity_offset_px = [0.0, 0.0]  # total disparity = disparity seen in the images + this, per step
+    positions_mm = [[0.0, 0.01], [5.02, 0.0]]    # measured x, y of every camera from any origin, rows one after the
+                                      # other; baseline_mm is then the nominal step that results count in
     [time]
     interval_s = 120.0
+    stamps_s = [0.0, 120.0, 245.0]    # measured time of every frame; interval_s defaults to the median step
+    # or stamps = "times.txt"         # a file with one number a line
 
 Camera indices ascend with sx and sy as numbers, whatever they start at; a baseline is negative where the camera moves
 to the left or up with them. Unknown keys are errors.
@@ -158,12 +162,21 @@ class Grid(_Section):
 
     baseline_mm: _PerAxis
     disparity_offset_px: _PerAxis = (0.0, 0.0)
+    positions_mm: tuple[tuple[_Finite, _Finite], ...] | None = None
 
 
 class Time(_Section):
     """Sampling in time."""
 
     interval_s: _Positive | None = None
+    stamps_s: tuple[_Finite, ...] | None = None
+    stamps: StrictStr | None = None
+
+    @model_validator(mode="after")
+    def _one_list(self) -> Self:
+        if self.stamps_s is not None and self.stamps is not None:
+            raise ValueError("give either stamps_s or the file stamps")
+        return self
 
 
 class Description(_Section):
@@ -192,6 +205,25 @@ def read_description(path: Path) -> Description:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     except ValidationError as error:
         raise ConfigError(f"{path}: {_one_line(error)}") from error
+
+
+def read_stamps(path: Path) -> tuple[float, ...]:
+    """The numbers of a file with one on each line; InputError, naming the line, where there is something else."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({error}): give a text file with one time in s on each line"
+        ) from error
+    found = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            found.append(float(line))
+        except ValueError:
+            raise InputError(f"{path}: line {number} is {line.strip()!r}: give one time in s on each line") from None
+    return tuple(found)
 
 
 def write_description(path: str | Path, description: Description) -> None:

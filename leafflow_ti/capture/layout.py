@@ -33,13 +33,15 @@ class Layout:
     file: npt.NDArray[np.int64]  # [t, sy, sx], index into paths
     page: npt.NDArray[np.int64]  # [t, sy, sx]
     values: dict[str, tuple[int, ...]]  # the numbers of the file names along t, sy, sx; (0,) for an axis not named
+    found: dict[str, tuple[int, ...]]  # the same without select: all that the pattern finds
     info: ImageInfo
 
 
 def find_layout(images: Images, root: Path) -> Layout:
     """Find and check all images of a description whose paths are relative to ``root``; headers only."""
     pattern = images.file_pattern
-    found = [(fields, path) for fields, path in pattern.discover(root) if _selected(fields, images.select)]
+    everything = list(pattern.discover(root))
+    found = [(fields, path) for fields, path in everything if _selected(fields, images.select)]
     if not found:
         raise InputError(f"no file fits {root / pattern.text}: check the pattern, its padding ({{t:03d}}), and select")
     first_index = min((fields["i"] for fields, _ in found if "i" in fields), default=0)
@@ -63,7 +65,8 @@ def find_layout(images: Images, root: Path) -> Layout:
         pages = pages.reshape([sizes.get(axis, 1) for axis in AXES])
         file, page = (np.ascontiguousarray(table) for table in np.broadcast_arrays(file, page + pages))
         values |= {axis: tuple(range(size)) for axis, size in sizes.items()}
-    return Layout(paths, file, page, values, info)
+    named = {axis: sorted({fields[axis] for fields, _ in everything}) for axis in images.select}
+    return Layout(paths, file, page, values, values | {axis: tuple(n) for axis, n in named.items()}, info)
 
 
 _Key = tuple[int, ...]  # values along AXES

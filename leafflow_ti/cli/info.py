@@ -60,6 +60,9 @@ def capture_facts(capture: FileCapture) -> dict[str, Any]:
         "geometry": None,
         "working_distance": None,
     }
+    if capture.stamps_s is not None and capture.frame_interval_s is not None:
+        steps = [b - a for a, b in zip(capture.stamps_s, capture.stamps_s[1:], strict=False)]
+        facts["steps_between_stamps_s"] = [min(steps, default=0.0), max(steps, default=0.0)]
     if capture.geometry is not None:
         g = capture.geometry
         facts["geometry"] = {
@@ -68,9 +71,25 @@ def capture_facts(capture: FileCapture) -> dict[str, Any]:
             "baseline_mm": list(g.baseline_mm),
             "disparity_offset_px": list(g.disparity_offset_px),
         }
+        if capture.positions_mm is not None:
+            facts["geometry"]["largest_deviation_mm"] = _largest_deviation(capture)
         if capture.n_rows * capture.n_cols > 1:
             facts["working_distance"] = _working_distance(capture)
     return facts
+
+
+def _largest_deviation(capture: FileCapture) -> dict[str, Any]:
+    """The camera that stands farthest from its nominal place: its row and column, and by how much along x and y, mm."""
+    import numpy as np
+
+    assert capture.geometry is not None
+    assert capture.positions_mm is not None
+    row0, col0 = capture.reference
+    (bx, by), (rows, cols) = capture.geometry.baseline_mm, capture.positions_mm.shape[:2]
+    nominal = np.stack(np.meshgrid((np.arange(cols) - col0) * bx, (np.arange(rows) - row0) * by), axis=-1)
+    off = capture.positions_mm - nominal
+    row, col = (int(i) for i in np.unravel_index(np.hypot(off[..., 0], off[..., 1]).argmax(), (rows, cols)))
+    return {"row": row, "column": col, "xy": off[row, col].round(9).tolist()}
 
 
 def _working_distance(capture: FileCapture) -> dict[str, Any]:
@@ -109,6 +128,9 @@ def _capture_lines(facts: dict[str, Any]) -> list[str]:
         f"images       {facts['files']} file(s), {image['width_px']} x {image['height_px']} px, "
         f"{image['bits']} bit in {image['dtype']}, {facts['bytes'] / 2**20:.4g} MiB of pixels",
     ]
+    if "steps_between_stamps_s" in facts:
+        shortest, longest = facts["steps_between_stamps_s"]
+        lines.append(f"stamps       measured; steps from {shortest:g} to {longest:g} s")
     if geometry is None:
         return [*lines, "geometry     not calibrated: optical flow in pixels only"]
     lines += [
@@ -116,6 +138,12 @@ def _capture_lines(facts: dict[str, Any]) -> list[str]:
         f"principal point {_pair(geometry['principal_point_px'])} px",
         f"grid step    {_pair(geometry['baseline_mm'])} mm (x, y)",
     ]
+    if "largest_deviation_mm" in geometry:
+        most = geometry["largest_deviation_mm"]
+        lines.append(
+            f"positions    measured; farthest from its nominal place: camera row {most['row']}, column "
+            f"{most['column']}, by {_pair(most['xy'])} mm (x, y)"
+        )
     if any(geometry["disparity_offset_px"]):
         lines.append(
             f"offset       {_pair(geometry['disparity_offset_px'])} px of disparity per step, added to what is seen"

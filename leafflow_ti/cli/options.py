@@ -112,6 +112,9 @@ Thin = Annotated[
 ]
 Taps = Annotated[str | None, _text("taps", "3x1x1|3|5|7", "Derivative filters [5].")]
 Blur = Annotated[float | None, _text("blur", "PX", "Gaussian that widens the filters along x, y: for fast motion [0].")]
+BlurTime = Annotated[
+    float | None, _text("blur-time", "FRAMES", "Gaussian that widens the filters along time: for slow motion [0].")
+]
 Prefilter = Annotated[
     str | None, _text("prefilter", "none|highpass|homomorphic", "Filter of every image against uneven light [none].")
 ]
@@ -150,7 +153,8 @@ SETTINGS: dict[str, Any] = {
     "brightness": Brightness, "brightness_terms": BrightnessTerms, "constraint": Constraint, "beta": Beta,
     "depth": Depth, "estimator": Estimator, "scale": Scale, "penalty": Penalty, "robust": Robust, "solver": Solver,
     "weighting": Weighting, "noise": Noise, "window": Window, "sigma": Sigma, "stride": Stride, "border": Border,
-    "refine": Refine, "refine_window": RefineWindow, "thin": Thin, "taps": Taps, "blur": Blur, "prefilter": Prefilter,
+    "refine": Refine, "refine_window": RefineWindow, "thin": Thin, "taps": Taps, "blur": Blur,
+    "blur_time": BlurTime, "prefilter": Prefilter,
     "sigma_pre": SigmaPre, "frames": Frames, "roi": Roi, "mask": Mask, "preshift": Preshift,
     "disparity_range": DisparityRange, "motion_range": MotionRange,
     "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads,

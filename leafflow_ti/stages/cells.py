@@ -15,8 +15,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.blocks import Blocks
 from leafflow_ti.models import AXES, Entry
-from leafflow_ti.sampling import Blocks, channel_noise
+from leafflow_ti.sampling import channel_noise
 from leafflow_ti.stages.channels import MASS, MapKey, Request
 from leafflow_ti.stages.windows import BlockMap
 
@@ -84,7 +85,7 @@ class Cells:
                     others = math.prod(sampling.axis(a).moment(e[AXES.index(a)]) for a in ("sx", "sy", "t"))
                     if (p.channel, p.vector) == (q.channel, q.vector) and others:
                         monomial = self.monomials.setdefault((e[_X], e[_Y]), len(self.monomials))
-                        factor = p.factor * q.factor * channel_noise(sampling, columns, p.channel) * others
+                        factor = p.factor * q.factor * channel_noise(sampling, columns, p.channel, tuple(e)) * others
                         found[r, c, monomial] = found.get((r, c, monomial), 0.0) + factor
         return [(*term, factor) for term, factor in found.items()]
 

@@ -160,14 +160,14 @@ class Channels:
             return plane.row * self.images[1] + plane.col
         return n if plane.row == INVALID else n + 1 + plane.col
 
-    def kernel(self, axis: str, name: str) -> Array:
-        """The centred kernel of a name."""
+    def kernel(self, axis: str, name: str, sample: int = 0) -> Array:
+        """The kernel of a name; ``sample``, from the reference: where samples are uneven, each has its own."""
         sampling = self.sampling.axis(axis)
         if name == "1":
             return np.ones(1)
         if name in ("n", "nn"):
-            return np.ones(2 * len(name) * sampling.filter_radius + 1)
-        once = sampling.kernel(name[0] == "d")
+            return np.ones(len(name) * (sampling.taps - 1) + 1)
+        once = sampling.kernel(name[0] == "d", sample)
         return np.convolve(once, sampling.kernel(False)) if len(name) == 2 else once
 
     def channel(self, request: Request, derivative: str | None, row: int, col: int) -> Plane:
@@ -258,19 +258,36 @@ class Channels:
         known = self._terms.get((axis, plane))
         if known is not None:
             return known
-        kernel = self.kernel(axis, getattr(plane, axis))
+        if axis == "sx" and self.sampling.grid and "1" not in (plane.sy, plane.sx):
+            return self._grid_terms(plane)
+        at = {"sy": plane.row - self.reference[0], "sx": plane.col - self.reference[1]}.get(axis, 0)
+        kernel = self.kernel(axis, getattr(plane, axis), at)
         names = ["" if a == axis else name for a, name in zip(Plane._fields[2:], plane[2:], strict=True)]
         source = Plane(plane.row, plane.col, *names)
         found = []
         for i, w in enumerate(kernel.tolist()):
             shift = i - len(kernel) // 2
-            if w and axis == "sy":
+            if axis == "t" and self.sampling.t.uneven:
+                found.append((source, shift, w))  # 0 here need not be 0 at the next frame
+            elif w and axis == "sy":
                 found.append((Plane(plane.row + shift, plane.col, *names), 0, w))
             elif w and axis == "sx":
                 found.append((Plane(plane.row, plane.col + shift, *names), 0, w))
             elif w:
                 found.append((source, shift, w))
         self._terms[axis, plane] = found
+        return found
+
+    def _grid_terms(self, plane: Plane) -> list[tuple[Plane, int, float]]:
+        """The same for both camera axes at once, in the pass along sx; the one along sy leaves the sources alone."""
+        assert self.sampling.grid is not None
+        row, col = plane.row - self.reference[0], plane.col - self.reference[1]
+        kernel = self.sampling.grid.kernel((plane.sy, plane.sx), row, col)
+        found = []
+        for (i, j), w in np.ndenumerate(kernel):
+            at = plane.row + i - kernel.shape[0] // 2, plane.col + j - kernel.shape[1] // 2
+            found.append((Plane(*at, plane.t, "1", "", plane.y, plane.x), 0, float(w)))
+        self._terms["sx", plane] = found
         return found
 
     @property

@@ -56,6 +56,7 @@ class EstimateStage:
 
         self.device, self.problem, self.view, self.differences = device, problem, view, differences
         self.apart = apart or device.gpu
+        self._tensor_layout, self._sources = layout, sources
         self._tables = ProblemTables(device, problem, layout, sources)
         self.layout = self._tables.layout
         self._steps = self._make_steps()
@@ -80,6 +81,15 @@ class EstimateStage:
         """Go on to images of another noise level [grey values]; takes effect with the next ``set_view``."""
         self.problem = replace(self.problem, noise=noise)
         self._tables.set_noise(noise)
+
+    def set_frame(self, frame: int) -> None:
+        """Go on to another reference frame of the sequence: nothing to do unless frames are uneven in time."""
+        problem = self.problem.about(frame)
+        if problem is not self.problem:
+            self.problem = problem
+            self._tables = ProblemTables(self.device, problem, self._tensor_layout, self._sources)
+            assert self._tables.layout == self.layout
+            self.set_view(self.view)
 
     def set_view(self, view: View) -> None:
         """Move to another band of the same size."""

@@ -321,7 +321,7 @@ class ProblemTables:
             one = self._with_cells(Tables(common.number.copy(), common.value), 1 + camera)
             number, value = one.number, one.value.copy()
             number[Number.FIRST_PLANE] = first_plane
-            value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = step
+            value[Value.CAMERA_STEP : Value.CAMERA_STEP + 2] = own.places[camera] if own.places else step
             for a, (partner, factor) in enumerate(shared_noise(self.problem.sampling, columns, own.columns, step)):
                 number[Number.PARTNER + a] = partner
                 if partner >= 0:

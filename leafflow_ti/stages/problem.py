@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from leafflow_ti.models import ColumnSet, TensorLayout
 from leafflow_ti.sampling import Sampling
@@ -15,7 +15,8 @@ class OwnFlows:
 
     ``steps``: (x, y) steps of each camera from the reference. ``offsets``: of their rows. ``unknowns``: components of
     (N, Ω, A) in the fit; ``growth``: and the rate at which the patch grows in its plane.
-    ``reference_rows``: the rows of the reference model take part, too.
+    ``reference_rows``: the rows of the reference model take part, too. ``places``: where the cameras really stand, (x,
+    y) in steps from the reference; none: at ``steps``.
     """
 
     columns: ColumnSet
@@ -25,6 +26,7 @@ class OwnFlows:
     unknowns: int
     reference_rows: bool
     growth: bool = False
+    places: tuple[tuple[float, float], ...] = ()
 
     @property
     def requests(self) -> tuple[Request, ...]:
@@ -60,6 +62,13 @@ class Problem:
     scale: float = 1.0
     penalty: str = "geman-mcclure"
     robust: str = "failed"
+
+    def about(self, frame: int) -> Problem:
+        """The problem about the reference frame ``frame``: another one where frames are uneven in time."""
+        if not self.sampling.t.uneven:
+            return self
+        own = self.own_flows and replace(self.own_flows, sampling=self.own_flows.sampling.about(frame))
+        return replace(self, sampling=self.sampling.about(frame), own_flows=own)
 
     def requests(self, layout: TensorLayout) -> tuple[Request, ...]:
         """What the tensor stage is asked for: the reference model's tensor, and those of the own flows."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,6 +76,7 @@ class RefineStage:
         self._mask: Any = None
         self._gaps: list[Gaps | None] = [None] * n
         lanes = device.dense.lanes
+        self._times = plan.frames
         self.set_view(view)
         storage, algebra = (np.dtype(device.real(kind)).itemsize for kind in ("storage", "algebra"))
         space = Workspaces.of(plan, lanes, (storage, algebra), device.gpu, device.threads)
@@ -89,7 +90,8 @@ class RefineStage:
     def set_view(self, view: View) -> None:
         """Take images that are shifted in another way, or another camera."""
         device, lanes = self.device, self.device.dense.lanes
-        tables = RefineTables.of(self.plan, view, lanes, self.pitch, device.gpu)
+        self._view = view
+        tables = RefineTables.of(replace(self.plan, frames=self._times), view, lanes, self.pitch, device.gpu)
         self.size = tables.size
         self._tables = (
             device.array(tables.size, "int"), device.array(tables.value, "algebra"),
@@ -101,6 +103,14 @@ class RefineStage:
         """Forget all frames."""
         self._slots.clear()
         self._next = 0
+
+    def set_frames(self, offsets: tuple[float, ...]) -> None:
+        """Enter the frames' offsets from where the results lie, as many as the plan has."""
+        if offsets == self._times:
+            return
+        assert len(offsets) == len(self._times)
+        self._times = offsets
+        self.set_view(self._view)
 
     def push(self, block: Array, finite: NDArray[np.bool_], hidden: NDArray[np.bool_] | None = None) -> None:
         """Take the next frame: images [sy, sx, rows, cols], where each is a grey value of an image, and where it shows

@@ -28,6 +28,8 @@ from leafflow_ti.trace import span
 
 __all__ = ["EXTRA_PLANES", "FACTOR_PLANES", "OUTPUT_PLANES", "Band", "Request", "TensorStage", "band_bytes"]
 OUTPUT_PLANES = 67
+_WEIGHT = 7
+"""Place of the linear terms' weights among the tables of the filters."""
 TASKS = 32
 """Tasks of a launch that the memory plan allows for."""
 
@@ -62,7 +64,7 @@ class TensorStage:
         requests = (Request(columns, layout, sampling), *own)
         lowered = Lowered(*_tables(requests), band, device.moments.lanes)
         self._lowered = lowered
-        self.n_taps = 2 * sampling.t.filter_radius + 1
+        self.n_taps = sampling.t.taps
         geometry = lowered.geometry
         self.out_pitch = geometry.out_pitch
         self._n_tiling = min(geometry.n_tiles, 4 * device.threads)
@@ -70,7 +72,7 @@ class TensorStage:
         sizes = lowered.sizes(self._n_tiling, 8 * device.threads)
         self._raw, self._scratch, self._maps, self._sums, self._wide = (self._zeros(n * lanes) for n in sizes[:5])
         self._starts = np.cumsum([0, *sizes[5:]]) * lanes
-        cells = [Cells(r, n) for n, r in enumerate(requests)] if weighed else []
+        self._cells = cells = [Cells(r, n) for n, r in enumerate(requests)] if weighed else []
         self.sources = source_planes(lowered, cells, int(self._starts[-1]))
         """Of each request, where windows are weighted anew."""
         self.tensors = self._zeros(int(self._starts[-1]) + source_size(lowered, cells))
@@ -85,14 +87,15 @@ class TensorStage:
         """Nothing that a kernel reads may be infinite, not even where the result does not count."""
         return self.device.zeros(size)
 
-    def reset(self) -> None:
-        """Forget all frames: the next one pushed starts a new window."""
+    def reset(self, first: int = 0) -> None:
+        """Forget all frames: the next one pushed starts a new window; it is the frame ``first`` of the sequence."""
         self._pushed = self._n_maps = 0
+        self._first = first
 
     @property
     def latency(self) -> int:
         """Frames between the newest one pushed and the one that the tensor belongs to."""
-        return self.sampling.t.radius
+        return self.sampling.t.after
 
     def _device_tables(self, lowered: Lowered) -> tuple[Any, ...]:
         """Steps, linear passes, products."""
@@ -109,6 +112,32 @@ class TensorStage:
             array([w for _, weights, *_ in groups for w in weights]), array([c for *_, c, _ in groups]),
             array([i for *_, i in groups], "int"),
         )  # fmt: skip
+
+    def _set_filters(self, middle: int) -> None:
+        """Frames that are uneven in time: enter the filters of the frame ``middle`` of the sequence."""
+        lowered, t = self._lowered, self.sampling.t
+        sample = middle - t.reference
+        terms = Terms.of(lowered.linear.terms)
+        weights = np.array(terms.weight)
+        for output, name in lowered.over_time:
+            if name in "db":
+                weights[terms.first[output] : terms.first[output + 1]] = t.kernel(name == "d", sample)
+        table = self.device.array(weights)
+        for name in ("_filter_tables", "_clean_tables"):
+            tables = getattr(self, name)
+            setattr(self, name, (*tables[:_WEIGHT], table, *tables[_WEIGHT + 1 :]))
+
+    def _set_windows(self, frame: int) -> None:
+        """Likewise: enter the windows along time about the reference ``frame``."""
+        t = self.sampling.t.about(frame)
+        for number, windows in enumerate(self._lowered.windows):
+            weights = [w for s in windows.sets for _ in windows.sources(s) for w in t.window(s.t)]
+            sums, across, down, n_sets = self._window_tables[number]
+            self._window_tables[number] = ((*sums[:-1], self.device.array(weights)), across, down, n_sets)
+        for number, cells in enumerate(self._cells):
+            weights = [w for _, power in cells.sources for w in t.window(power)]
+            n, tables = self._source_tables[number]
+            self._source_tables[number] = (n, (*tables[:-1], self.device.array(weights)))
 
     def _tables_without_invalid(self, lowered: Lowered) -> tuple[Any, ...]:
         """The same for frames without invalid pixels."""
@@ -129,7 +158,7 @@ class TensorStage:
             begin = len(sums)
             for source in windows.sources(wide_set):
                 at = number[source] * g.map_plane
-                sums.append([((at, i), w) for i, w in enumerate(weights) if w])
+                sums.append([((at, i), w) for i, w in enumerate(weights) if w or t.uneven])
             for wide in windows.wides:
                 if wide[0] == wide_set:
                     source_at = [begin * g.map_plane + i * g.map_plane for i, _ in windows.across(wide)]
@@ -164,6 +193,8 @@ class TensorStage:
             if not self._add_frame(block, valid, factors):
                 return None
         with span("tensor"):
+            if self.sampling.t.uneven:
+                self._set_windows(self._first + self._pushed - 1 - self.latency)
             for number in range(len(self._window_tables)):
                 self._make_tensor(number)
             for number in range(len(self._source_tables)):
@@ -185,6 +216,8 @@ class TensorStage:
         self._pushed += 1
         if self._pushed < self.n_taps:
             return False
+        if self.sampling.t.uneven:
+            self._set_filters(self._first + self._pushed - 1 - self.n_taps // 2)
         self._make_maps()
         return self._n_maps >= self.sampling.t.size
 
@@ -228,8 +261,9 @@ class TensorStage:
         """Sums over the frames of the window of every source of a request's cells: their number, and the tables."""
         lowered, array, t = self._lowered, self.device.array, self.sampling.t
         number = {b: n for n, b in enumerate(lowered.block_maps)}
+        plane = lowered.geometry.map_plane
         terms = Terms.of([
-            [((number[block] * lowered.geometry.map_plane, i), w) for i, w in enumerate(t.window(power).tolist()) if w]
+            [((number[block] * plane, i), w) for i, w in enumerate(t.window(power).tolist()) if w or t.uneven]
             for block, power in cells.sources
         ])  # fmt: skip
         return len(cells.sources), (

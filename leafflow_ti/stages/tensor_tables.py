@@ -163,6 +163,8 @@ class Lowered:
         self.steps: list[Ints] = []
         self._about_invalid: Ints = []
         self.linear = Linear()
+        self.over_time: list[tuple[int, str]] = []
+        """Linear outputs that are made along time, and the names of their kernels."""
         self._n_linear = self._n_groups = 0
         self._lay_out_blocks(*self._lay_out_products(self._lay_out_filters()))
         self.zero = self.scratch
@@ -181,7 +183,7 @@ class Lowered:
         halo = self.geometry.halo[0]
         rings = {ry: self._region(reaches.count(ry), True, halo + ry + 1) for ry in sorted(set(reaches))}
         base = end = self.scratch
-        raw = Region(0, 0, 2 * channels.sampling.t.filter_radius + 1, self.frame_size)
+        raw = Region(0, 0, channels.sampling.t.taps, self.frame_size)
         places: dict[Plane, tuple[int, Region]] = {}
         for one in channels.passes:
             k = active.index(one) if one in active else -1
@@ -215,6 +217,8 @@ class Lowered:
         """One step: some planes of a pass, whose sources keep equally many rows."""
         channels, g = self.channels, self.geometry
         for plane in planes:
+            if one.axis == "t":
+                self.over_time.append((len(self.linear.terms), plane.t))
             terms = []
             for origin, shift, w in channels.terms(one.axis, plane):
                 if one.axis == "t":
@@ -337,7 +341,7 @@ class Lowered:
         # What windows look at beyond the last row.
         beyond = UNROLLED * max(g.step_x, g.step_y) + g.width
         return [
-            (2 * self.channels.sampling.t.filter_radius + 1) * self.frame_size + beyond,
+            self.channels.sampling.t.taps * self.frame_size + beyond,
             min(tiling, g.n_tiles) * self.scratch + g.width,
             n_t * self.slot_size + beyond,
             sums + beyond,

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.blocks import Blocks
 from leafflow_ti.models import AXES
-from leafflow_ti.sampling import Blocks
 from leafflow_ti.stages.channels import EXTRAS, MASS, MapKey, Request
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from reference import chain
 
 from leafflow_ti.models import ColumnSet
-from leafflow_ti.sampling import Sampling, column_noise, noise_gain
+from leafflow_ti.sampling import Sampling, column_noise
 
 Array = np.ndarray
 
@@ -71,9 +71,15 @@ def noise_vectors(sampling: Sampling, columns: ColumnSet):
         for term in column.terms:
             g = found.setdefault((term.channel, term.vector), np.zeros((columns.n, *grids["t"].shape)))
             derived = columns.derived.get(term.channel)
-            gain = derived.gain if derived else noise_gain(sampling, term.channel)
+            gain = derived.gain if derived else channel_gains(sampling, term.channel)
             g[i] += term.factor * np.sqrt(gain) * chain.monomial(grids, term.exponents)
     return list(found.values())
+
+
+def channel_gains(sampling: Sampling, channel):
+    """Noise gain of a channel at every sample [t, sy, sx, y, x]."""
+    gains = (sampling.axis(a).gains(a == channel) for a in chain.ARRAY_AXIS)
+    return np.einsum("i,j,k,l,m", *gains)
 
 
 def cell_sums(vectors, seen, sampling: Sampling, exact):

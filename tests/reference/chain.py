@@ -16,17 +16,49 @@ ARRAY_AXIS = {"t": 0, "sy": 1, "sx": 2, "y": 3, "x": 4}
 
 
 def derivative(images, sampling: Sampling, channel: str):
-    """One channel of ``images`` [t, sy, sx, y, x], same shape; the outermost filter radius is meaningless."""
+    """One channel of ``images`` [t, sy, sx, y, x], same shape; the outermost filter radius is meaningless.
+
+    Along time a sample of an even number of taps stands at the frame before it. On uneven axes each sample has its own
+    kernel; ``images`` hold what the sampling needs along cameras and time, its reference at the index ``before``.
+    """
     out = np.asarray(images, dtype=np.float64)
+    if sampling.grid and out.shape[1] > 1 and out.shape[2] > 1:
+        out = grid_derivative(out, sampling, channel)
     for name in AXES:
-        out = correlate1d(out, sampling.axis(name).kernel(name == channel), axis=ARRAY_AXIS[name], mode="nearest")
+        axis, at = sampling.axis(name), ARRAY_AXIS[name]
+        if sampling.grid and name in ("sx", "sy"):
+            continue
+        if name in ("x", "y") or not (axis.uneven or axis.taps % 2 == 0):
+            out = correlate1d(out, axis.kernel(name == channel), axis=at, mode="nearest")
+            continue
+        filtered = np.zeros_like(out)
+        for sample in range(-(axis.size // 2), axis.size // 2 + 1):
+            first = axis.before + sample - (axis.taps - 1) // 2
+            under = np.take(out, range(first, first + axis.taps), axis=at)
+            value = np.tensordot(axis.kernel(name == channel, sample), under, axes=(0, at))
+            np.moveaxis(filtered, at, 0)[axis.before + sample] = value
+        out = filtered
+    return out
+
+
+def grid_derivative(images, sampling: Sampling, channel):
+    """``images`` filtered along both camera axes at once."""
+    out = np.zeros_like(images)
+    sy, sx = sampling.sy, sampling.sx
+    for row in range(-(sy.size // 2), sy.size // 2 + 1):
+        for col in range(-(sx.size // 2), sx.size // 2 + 1):
+            kernel = sampling.grid.kernel(("d" if channel == "sy" else "b", "d" if channel == "sx" else "b"), row, col)
+            i, j = (a.radius + n for a, n in ((sy, row), (sx, col)))
+            h, w = (n // 2 for n in kernel.shape)
+            out[:, i, j] = np.einsum("rc,trcyx->tyx", kernel, images[:, i - h : i + h + 1, j - w : j + w + 1])
     return out
 
 
 def filters_see(valid, sampling: Sampling):
     """Where every pixel under the filters is valid; [t, y, x] like ``valid``."""
-    size = [2 * sampling.axis(a).filter_radius + 1 for a in ("t", "y", "x")]
-    return minimum_filter(valid.astype(float), size, mode="nearest")
+    size = [sampling.axis(a).taps for a in ("t", "y", "x")]
+    # Of an even number of frames, the one before the middle and those behind it.
+    return minimum_filter(valid.astype(float), size, mode="nearest", origin=[-1 + size[0] % 2, 0, 0])
 
 
 def window_of(images, sampling: Sampling, columns: ColumnSet, pixel, valid=None):
@@ -37,7 +69,7 @@ def window_of(images, sampling: Sampling, columns: ColumnSet, pixel, valid=None)
     [t, y, x] do not count.
     """
     reach = {a: sampling.axis(a).size // 2 for a in ARRAY_AXIS}
-    where = {a: images.shape[ARRAY_AXIS[a]] // 2 for a in ("t", "sy", "sx")} | dict(zip("xy", pixel, strict=True))
+    where = {a: sampling.axis(a).before for a in ("t", "sy", "sx")} | dict(zip("xy", pixel, strict=True))
     window = {a: slice(where[a] - reach[a], where[a] + reach[a] + 1) for a in ARRAY_AXIS}
     channels = {c: derivative(images, sampling, c)[tuple(window.values())] for c in columns.channels}
     grids = offsets(sampling)
@@ -54,7 +86,7 @@ def window_of(images, sampling: Sampling, columns: ColumnSet, pixel, valid=None)
 
 def offsets(sampling: Sampling):
     """Offset of every sample of the window from its centre, by axis, each [t, sy, sx, y, x]."""
-    along = [np.arange(n, dtype=float) - n // 2 for n in (sampling.axis(a).size for a in ARRAY_AXIS)]
+    along = [sampling.axis(a).offsets for a in ARRAY_AXIS]
     return dict(zip(ARRAY_AXIS, np.meshgrid(*along, indexing="ij"), strict=True))
 
 
@@ -114,7 +146,7 @@ def at_centre(P, cov, columns: ColumnSet):
 
 def texture_smoothness(images, sampling: Sampling, x, y):
     """The factor ρ: energy of the reference camera's gradient smoothed once more in x and y, over its energy."""
-    middle = [n // 2 for n in images.shape[:3]]
+    middle = [sampling.axis(a).before for a in ("t", "sy", "sx")]
     h, w = sampling.y.size // 2, sampling.x.size // 2
     window = np.outer(sampling.y.weights, sampling.x.weights)
     energy = np.zeros(2)

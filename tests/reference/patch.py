@@ -139,10 +139,10 @@ def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampl
         factor = 1.0
         exponents = dict(zip(AXES, column.terms[0].exponents, strict=True))
         for axis, k in zip(("sx", "sy"), step, strict=True):
-            weights, smooth = np.array(sampling.axis(axis).weights), sampling.axis(axis).kernel(False)
-            half, radius = len(weights) // 2, len(smooth) // 2
+            one = sampling.axis(axis)
+            half, radius = one.size // 2, one.filter_radius
             factor *= sum(
-                weights[i + half] * float(i) ** exponents[axis] * smooth[k - i + radius]
+                one.weights[i + half] * one.offsets[i + half] ** exponents[axis] * one.kernel(False, i)[k - i + radius]
                 for i in range(-half, half + 1)
                 if abs(k - i) <= radius
             )
@@ -215,19 +215,19 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
 
         return rows_of(value, C, shared, design, codes, problem.use_range, q), rows
 
-    def own_rows(step, found_own, q):
+    def own_rows(step, place, found_own, q):
         flows = problem.own_flows
         s2 = found_own.variance
         p, C = found_own.at_centre(flows.columns, flows.sampling, denoise, view.motion_px)
         C = C[0, 0]
         rows = [flows.columns.index(d, o) for d in ("x", "y") for o in flows.offsets]
         E = np.eye(flows.columns.n_flow)[rows]
-        moved = [step[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
+        moved = [place[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
         for r, (d, o) in enumerate((d, o) for d in ("x", "y") for o in flows.offsets):
             if o == "1":
                 for axis, distance in zip(("x", "y"), moved, strict=True):
                     E[r, flows.columns.index(d, axis)] += distance
-        x, y = (at + g[0] * baseline[i] * step[i] for i, at in enumerate((x0, y0)))
+        x, y = (at + g[0] * baseline[i] * place[i] for i, at in enumerate((x0, y0)))
 
         def design(geometry, q):
             Z0, ZX, ZY, _ = surface(x0, y0, f, *geometry)
@@ -284,8 +284,9 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
         return q[: problem.fitted], spreads, q
     first, rows = reference_rows(q)
     sets, common = ([first], []) if problem.own_flows.reference_rows else ([], [])
-    for step, one in zip(problem.own_flows.steps, own, strict=True):
-        found, shared = own_rows(step, one, q)
+    flows = problem.own_flows
+    for step, place, one in zip(flows.steps, flows.places or flows.steps, own, strict=True):
+        found, shared = own_rows(step, place, one, q)
         if chosen:
             # In this camera it may have chosen another surface.
             A, value, C, D, _, left_out, _ = found
