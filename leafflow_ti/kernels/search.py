@@ -3,8 +3,7 @@
 *Labels* are candidate displacements ``(x, y)``; every square *tile* of the image has its own list of at most ``slots``
 of them. *Views* are images that see a label as the displacement ``(x fx, y fy)``, each with its factors ``f``; views
 on one side of the reference form an *arm*. The cost of a label in an arm is the mean over its views of the truncated
-difference of features, averaged over the *support* of the pixel: the pixels around that look like it. What is occluded
-on one side is mostly seen from the other: the better half of the arms decides.
+difference of features; ``search_support`` takes the better arms' mean over the pixels around that look alike.
 
 The aggregation is that of Hirschmüller (semi-global matching, 2008): along straight paths the least sum of costs, and
 of penalties ``p1`` between neighbouring labels and ``p2`` between any others; lower where the image has an edge.
@@ -23,7 +22,7 @@ SIDES = 4
 
 @functools.cache
 def _formulas(spec: KernelSpec):
-    """Functions of one pixel: ``costs``, ``support`` and ``winner``; of one path: ``path``."""
+    """Functions of one pixel: ``costs`` and ``winner``; of one path: ``path``."""
     real = spec.real
 
     @ti.func
@@ -53,7 +52,7 @@ def _formulas(spec: KernelSpec):
         slots: ti.i32, most: real, count: ti.template(), label: ti.template(), arm: ti.template(),
         factor: ti.template(), feature: ti.template(), cost: ti.template(),
     ):  # fmt: skip
-        """Costs of the labels in every arm; ``most`` where no view of the arm shows the place."""
+        """Costs of the labels in every arm; ``most`` where no view of the arm shows the place, and without label."""
         y = pixel // cols
         x = pixel - y * cols
         here = (y // tile) * tiles_x + x // tile
@@ -69,50 +68,8 @@ def _formulas(spec: KernelSpec):
                         total += difference(pixel, v, sx, sy, rows, cols, channels, most, feature)
                         seen += 1.0
                 cost[(a * rows * cols + pixel) * slots + k] = ti.select(seen > 0.0, total / ti.max(seen, 1.0), most)
-
-    @ti.func
-    def support(
-        pixel: ti.i32, task: ti.i32, rows: ti.i32, cols: ti.i32, n_arms: ti.i32, radius: ti.i32, tile: ti.i32,
-        tiles_x: ti.i32, slots: ti.i32, scale: real, count: ti.template(), near: ti.template(), guide: ti.template(),
-        mask: ti.template(), arm_cost: ti.template(), place: ti.template(), weight: ti.template(), cost: ti.template(),
-    ):  # fmt: skip
-        """Costs of the labels over the support, mean over the better half of the arms; 0 where ``mask`` is 0."""
-        y = pixel // cols
-        x = pixel - y * cols
-        row, col = y // tile, x // tile
-        here = row * tiles_x + col
-        most = (2 * radius + 1) * (2 * radius + 1)
-        n = 0
-        mass = ti.cast(0.0, real)
-        for j in range(ti.max(y - radius, 0), ti.min(y + radius + 1, rows)):
-            for i in range(ti.max(x - radius, 0), ti.min(x + radius + 1, cols)):
-                if mask[j * cols + i] > 0:
-                    w = ti.exp(-ti.abs(guide[j * cols + i] - guide[pixel]) / scale)
-                    place[(task * most + n) * 2] = j * cols + i
-                    place[(task * most + n) * 2 + 1] = 4 + 3 * (j // tile - row) + i // tile - col
-                    weight[task * most + n] = w
-                    mass += w
-                    n += 1
-        for k in range(count[here]):
-            best, second = ti.cast(1e30, real), ti.cast(1e30, real)
-            for a in range(n_arms):
-                total = ti.cast(0.0, real)
-                found = mass
-                for m in range(task * most, task * most + n):
-                    slot = k
-                    if place[2 * m + 1] != 4:
-                        slot = near[((here * NEAR + place[2 * m + 1]) * slots + k) * NEAR]
-                    if slot >= 0:
-                        total += weight[m] * arm_cost[(a * rows * cols + place[2 * m]) * slots + slot]
-                    else:
-                        found -= weight[m]
-                mean = total / ti.max(found, 1e-6)
-                second = ti.min(second, ti.max(mean, best))
-                best = ti.min(best, mean)
-            value = best
-            if n_arms > 2:
-                value = (best + second) / ti.cast(2.0, real)
-            cost[pixel * slots + k] = ti.select(mask[pixel] > 0, value, ti.cast(0.0, real))
+            for k in range(count[here], slots):
+                cost[(a * rows * cols + pixel) * slots + k] = most
 
     @ti.func
     def start_of(line: ti.i32, rows: ti.i32, cols: ti.i32, step_y: ti.i32, step_x: ti.i32):
@@ -129,7 +86,7 @@ def _formulas(spec: KernelSpec):
     @ti.func
     def path(
         line: ti.i32, rows: ti.i32, cols: ti.i32, step_y: ti.i32, step_x: ti.i32, tile: ti.i32, tiles_x: ti.i32,
-        slots: ti.i32, p1: real, p2: real, scale: real, count: ti.template(), near: ti.template(),
+        slots: ti.i32, ordered: ti.i32, p1: real, p2: real, scale: real, count: ti.template(), near: ti.template(),
         guide: ti.template(), cost: ti.template(), behind: ti.template(), total: ti.template(),
     ):  # fmt: skip
         """Follow one path through the image; ``total`` grows by its sums of costs."""
@@ -149,26 +106,31 @@ def _formulas(spec: KernelSpec):
                 for k in range(count[here]):
                     value = cost[pixel * slots + k]
                     behind[now + k] = value
-                    total[pixel * slots + k] += value
+                    total[pixel * slots + k] = total[pixel * slots + k] + value  # += would be atomic
                     shift = ti.min(shift, value)
             else:
                 relation = (
                     4 + 3 * (tile_before // tiles_x - row) + tile_before - (tile_before // tiles_x) * tiles_x - col
                 )
                 for k in range(count[here]):
-                    table = ((here * NEAR + relation) * slots + k) * NEAR
                     best = least + jump
-                    own = near[table]
-                    if own >= 0:
-                        best = ti.min(best, behind[before + own])
-                    for n in range(1, NEAR):
-                        other = near[table + n]
-                        if other < 0:
-                            break
-                        best = ti.min(best, behind[before + other] + p1)
+                    if ordered > 0:
+                        best = ti.min(best, behind[before + k])
+                        best = ti.min(best, behind[before + ti.max(k - 1, 0)] + p1)
+                        best = ti.min(best, behind[before + ti.min(k + 1, count[here] - 1)] + p1)
+                    else:
+                        table = ((here * NEAR + relation) * slots + k) * NEAR
+                        own = near[table]
+                        if own >= 0:
+                            best = ti.min(best, behind[before + own])
+                        for n in range(1, NEAR):
+                            other = near[table + n]
+                            if other < 0:
+                                break
+                            best = ti.min(best, behind[before + other] + p1)
                     value = cost[pixel * slots + k] + best - least
                     behind[now + k] = value
-                    total[pixel * slots + k] += value
+                    total[pixel * slots + k] = total[pixel * slots + k] + value  # += would be atomic
                     shift = ti.min(shift, value)
             least, tile_before, grey_before = shift, here, grey
             now, before = before, now
@@ -202,13 +164,13 @@ def _formulas(spec: KernelSpec):
                     value += off * (label[(at + two) * 2 + axis] - label[(at + one) * 2 + axis]) / ti.cast(2.0, real)
             found[axis * rows * cols + pixel] = value
 
-    return costs, support, path, winner
+    return costs, path, winner
 
 
 @functools.cache
 def costs_kernel(spec: KernelSpec):
     """Costs in every arm of every label of the pixel's tile."""
-    costs, _, _, _ = _formulas(spec)
+    costs, _, _ = _formulas(spec)
     real = spec.real
 
     @ti.kernel
@@ -249,54 +211,9 @@ def costs_kernel(spec: KernelSpec):
 
 
 @functools.cache
-def support_kernel(spec: KernelSpec):
-    """``cost[pixel, slot]`` over the support of each pixel, from all arms."""
-    _, support, _, _ = _formulas(spec)
-    real = spec.real
-
-    @ti.kernel
-    def support_costs(
-        rows: ti.i32,
-        cols: ti.i32,
-        n_arms: ti.i32,
-        radius: ti.i32,
-        tile: ti.i32,
-        tiles_x: ti.i32,
-        slots: ti.i32,
-        scale: real,
-        n_tasks: ti.i32,
-        count_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tiles]
-        near_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tiles, NEAR, slots, NEAR]
-        guide_in: ti.types.ndarray(dtype=real, ndim=1),  # [rows, cols]
-        mask_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [rows, cols]
-        arm_cost_in: ti.types.ndarray(dtype=real, ndim=1),  # [n_arms, rows, cols, slots]
-        place_tmp: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tasks, (2 radius + 1)², 2], tasks = pixels on a GPU
-        weight_tmp: ti.types.ndarray(dtype=real, ndim=1),  # [tasks, (2 radius + 1)²]
-        cost_out: ti.types.ndarray(dtype=real, ndim=1),  # [rows, cols, slots]
-    ):
-        size = rows * cols
-        if ti.static(spec.gpu):
-            for p in range(size):
-                support(
-                    p, p, rows, cols, n_arms, radius, tile, tiles_x, slots, scale, count_in, near_in, guide_in, mask_in,
-                    arm_cost_in, place_tmp, weight_tmp, cost_out,
-                )  # fmt: skip
-        else:
-            for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
-                if part == 0:
-                    for p in range(task * size // n_tasks, (task + 1) * size // n_tasks):
-                        support(
-                            p, task, rows, cols, n_arms, radius, tile, tiles_x, slots, scale, count_in, near_in,
-                            guide_in, mask_in, arm_cost_in, place_tmp, weight_tmp, cost_out,
-                        )  # fmt: skip
-
-    return support_costs
-
-
-@functools.cache
 def paths_kernel(spec: KernelSpec):
     """Adds the sums of costs along all paths of one direction to ``total``."""
-    _, _, path, _ = _formulas(spec)
+    _, path, _ = _formulas(spec)
     real = spec.real
 
     @ti.kernel
@@ -309,6 +226,7 @@ def paths_kernel(spec: KernelSpec):
         tile: ti.i32,
         tiles_x: ti.i32,
         slots: ti.i32,
+        ordered: ti.i32,  # 1: one list of labels, each a neighbour of the next; ``near`` is not read
         p1: real,
         p2: real,
         scale: real,
@@ -323,16 +241,16 @@ def paths_kernel(spec: KernelSpec):
         if ti.static(spec.gpu):
             for line in range(n_lines):
                 path(
-                    line, rows, cols, step_y, step_x, tile, tiles_x, slots, p1, p2, scale, count_in, near_in, guide_in,
-                    cost_in, behind_tmp, total_io,
+                    line, rows, cols, step_y, step_x, tile, tiles_x, slots, ordered, p1, p2, scale, count_in, near_in,
+                    guide_in, cost_in, behind_tmp, total_io,
                 )  # fmt: skip
         else:
             for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
                 if part == 0:
                     for line in range(task * n_lines // n_tasks, (task + 1) * n_lines // n_tasks):
                         path(
-                            line, rows, cols, step_y, step_x, tile, tiles_x, slots, p1, p2, scale, count_in, near_in,
-                            guide_in, cost_in, behind_tmp, total_io,
+                            line, rows, cols, step_y, step_x, tile, tiles_x, slots, ordered, p1, p2, scale, count_in,
+                            near_in, guide_in, cost_in, behind_tmp, total_io,
                         )  # fmt: skip
 
     return add_paths
@@ -341,7 +259,7 @@ def paths_kernel(spec: KernelSpec):
 @functools.cache
 def winners_kernel(spec: KernelSpec):
     """Per pixel the best label's slot, its displacement with fraction, and its own cost."""
-    _, _, _, winner = _formulas(spec)
+    _, _, winner = _formulas(spec)
     real = spec.real
 
     @ti.kernel

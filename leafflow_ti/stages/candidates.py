@@ -10,7 +10,7 @@ from leafflow_ti.stages.search import Image, Labels
 Candidates = NDArray[np.int64]
 """[n, 2] (x, y) of one tile, the most promising first."""
 
-SLOTS = 40
+SLOTS = 32
 """Labels at most among which a pixel chooses."""
 CANDIDATE_TILE, CORRELATED, PEAKS = 32, 64, 6
 """Correlations: distance and size [px] of their windows, peaks of each."""

@@ -6,13 +6,14 @@ displacement) and penalties; see ``kernels.search``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.runtime import Device
+from leafflow_ti.stages.planes import round_up
 
 Image = NDArray[np.float32]
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
@@ -62,6 +63,11 @@ class Labels:
     def slots(self) -> int:
         """Labels per tile at most."""
         return int(self.values.shape[1])
+
+    def padded(self, multiple: int) -> Labels:
+        """The same labels in a number of slots that is a multiple of this."""
+        more = round_up(self.slots, multiple) - self.slots
+        return replace(self, values=np.pad(self.values, ((0, 0), (0, more), (0, 0))))
 
     def near(self) -> NDArray[np.int32]:
         """[tiles, 9, slots, NEAR]: slots of the same label (first; -1 if there is none) and of its neighbours, ended by
@@ -170,9 +176,11 @@ def search(
     ``stack`` [1 + views, channels, H, W] features, the reference first; ``guide`` [H, W] the image whose edges may be
     edges of surfaces, in units of a typical difference of neighbours; ``mask`` [H, W]: pixels that count.
     """
-    from leafflow_ti.kernels.search import costs_kernel, paths_kernel, support_kernel, winners_kernel
+    from leafflow_ti.kernels.search import costs_kernel, paths_kernel, winners_kernel
+    from leafflow_ti.kernels.search_support import support_kernel
 
-    spec = device.planes
+    spec = device.moments
+    labels = labels.padded(spec.lanes)
     _, channels, rows, cols = stack.shape
     size, slots = rows * cols, labels.slots
     tables = (device.array(labels.count, "int"), device.array(labels.values))
@@ -185,16 +193,17 @@ def search(
     near, greys = device.array(labels.near(), "int"), device.array(guide)
     scratch = (size if device.gpu else n_tasks) * side**2
     support_kernel(spec)(
-        rows, cols, n_arms, costs.support, labels.tile, labels.tiles_x, slots, costs.alike, n_tasks, tables[0], near,
-        greys, device.array(mask, "int"), arm_cost, device.empty(2 * scratch, "int"), device.empty(scratch), cost,
+        rows, cols, n_arms, costs.support, labels.tile, labels.tiles_x, slots, costs.alike, n_tasks, near, greys,
+        device.array(mask, "int"), arm_cost, device.vectors(arm_cost, spec.lanes), device.empty(2 * scratch, "int"),
+        device.empty(scratch), device.vectors(cost, spec.lanes),
     )  # fmt: skip
     most_lines = rows + cols - 1
     behind = device.empty(2 * most_lines * slots)
     for step_y, step_x in DIRECTIONS:
         n_lines = rows if step_y == 0 else cols if step_x == 0 else most_lines
         paths_kernel(spec)(
-            n_lines, rows, cols, step_y, step_x, labels.tile, labels.tiles_x, slots, costs.small, costs.large,
-            costs.edge, device.tasks(n_lines), tables[0], near, greys, cost, behind, total,
+            n_lines, rows, cols, step_y, step_x, labels.tile, labels.tiles_x, slots, int(labels.line),
+            costs.small, costs.large, costs.edge, device.tasks(n_lines), tables[0], near, greys, cost, behind, total,
         )  # fmt: skip
     chosen, found, price = device.empty(size, "int"), device.empty(2 * size), device.empty(size)
     winners_kernel(spec)(
