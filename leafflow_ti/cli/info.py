@@ -67,6 +67,9 @@ def capture_facts(capture: FileCapture) -> dict[str, Any]:
             "principal_point_px": list(g.principal_px),
             "baseline_mm": list(g.baseline_mm),
             "disparity_offset_px": list(g.disparity_offset_px),
+            "calibration": capture.description.camera.calibration
+            if capture.description and capture.description.camera
+            else None,
         }
         if capture.n_rows * capture.n_cols > 1:
             facts["working_distance"] = _working_distance(capture)
@@ -116,6 +119,10 @@ def _capture_lines(facts: dict[str, Any]) -> list[str]:
         f"principal point {_pair(geometry['principal_point_px'])} px",
         f"grid step    {_pair(geometry['baseline_mm'])} mm (x, y)",
     ]
+    if geometry["calibration"]:
+        lines.append(
+            f"calibration  {geometry['calibration']}: images are undistorted and rectified while they are read"
+        )
     if any(geometry["disparity_offset_px"]):
         lines.append(
             f"offset       {_pair(geometry['disparity_offset_px'])} px of disparity per step, added to what is seen"
