@@ -59,6 +59,7 @@ CASES = (
     Case("estimators-edges", "estimators.edges:run", "the cube within 20 px of its edges, plain and robust"),
     Case("estimators-coverage", "estimators.coverage:run", "whether error bars are true, by estimator and noise"),
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
+    Case("plan-rig", "plan_rig:run", "errors predicted for a camera rig against the scatter of simulated estimates"),
     Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),
     Case("stages", "stages:run", "microseconds per output pixel and stage, share of the machine's ceilings; memory"),
     Case(
