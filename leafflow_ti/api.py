@@ -20,11 +20,12 @@ from leafflow_ti.capture import Capture, open_capture
 from leafflow_ti.config import RunConfig, load_config
 from leafflow_ti.errors import RunError
 from leafflow_ti.field import Field, empty_map, status_counts
-from leafflow_ti.pipeline import Maps, Pipeline
+from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan, Unit, make_plan
 from leafflow_ti.progress import Progress, RunSummary, Timings
 from leafflow_ti.results import ResultStore
 from leafflow_ti.runtime import Device, start
+from leafflow_ti.stays import Maps
 from leafflow_ti.trace import active, span
 
 

@@ -15,6 +15,7 @@ from leafflow_ti.models import TensorLayout
 from leafflow_ti.range_plan import RangePlan
 from leafflow_ti.refine_plan import Refinement
 from leafflow_ti.runtime import DENSE_LANES, usable_threads
+from leafflow_ti.search import peak_bytes
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.planes import round_up
 from leafflow_ti.stages.prefilter import prefilter_bytes
@@ -24,6 +25,13 @@ from leafflow_ti.stages.tensor import Band, band_bytes
 
 BAND_PIXELS = 1 << 17
 """Output pixels of a unit where memory allows: large enough to amortise halos, small enough to answer an interrupt."""
+TILE_PIXELS = 192
+"""Image pixels along a side of a tile that is computed once per label: wide beside the halo, small beside a surface."""
+LABELS_AT_ONCE = 12
+"""Passes of a tile whose maps are held until its pixels have chosen, as they are planned for."""
+MAPS_BESIDE = 16
+HIDING_BYTES = 8
+"""Of a pixel of a camera's block: marks of what hides it, as they are made and as they are used."""
 READ_AHEAD = 2
 """Frames read before they are needed, where memory allows: one is decoded while the other is ready."""
 INDEXED = 2**31 - 1
@@ -34,7 +42,11 @@ WRITE_BEHIND = 2
 
 @dataclass(frozen=True)
 class Demand:
-    """What decides the memory of a unit. ``cols``: output columns; ``n_cameras`` are read, ``n_maps`` written."""
+    """What decides the memory of a unit. ``cols``: output columns; ``n_cameras`` are read, ``n_maps`` written.
+
+    ``tile_cols``: of a tile where the images are shifted tile by tile, 0 elsewhere; ``image``: rows and columns of an
+    image, where it is searched.
+    """
 
     config: RunConfig
     problem: Problem
@@ -44,12 +56,14 @@ class Demand:
     n_cameras: int
     n_maps: int
     cols: int
+    tile_cols: int = 0
+    image: tuple[int, int] = (0, 0)
 
     def coefficients(self, rows: int) -> int:
         """Spline coefficients of the refinement for units of ``rows`` rows."""
         if self.refine is None:
             return 0
-        band = Band.of(self.problem.sampling, rows + 2, self.cols + 2, int(self.config.window.stride))
+        band = self._band(rows)
         widening = 2 * self.refine.widening(band.halo_y, band.halo_x)
         plane = (band.in_rows + widening) * round_up(band.in_cols + widening, 64)
         return len(self.refine.frames) * self.n_cameras * plane
@@ -58,8 +72,7 @@ class Demand:
         """Memory for units of ``rows`` rows while ``ahead`` frames are read ahead."""
         config, problem, ranges = self.config, self.problem, self.ranges
         itemsize = 4 if config.precision == "f32" else 8
-        # Two more rows and columns for the growth at the edges, and for the start of a refinement there.
-        band = Band.of(problem.sampling, rows + 2, self.cols + 2, int(config.window.stride))
+        band = self._band(rows)
         own = problem.own_flows.requests if problem.own_flows else ()
         gpu = config.arch not in ("auto", "cpu")
         weighed = ESTIMATORS[problem.estimator].weighs
@@ -83,8 +96,17 @@ class Demand:
         # Grey values, and one byte that says whether each is finite.
         block = self.n_cameras * (in_rows + 2 * margin) * (in_cols + 2 * margin) * (itemsize + 1)
         unit = rows * self.cols * (4 * self.n_maps + 1)
+        if self.tile_cols:
+            maps = 2 * self.n_maps + MAPS_BESIDE  # standard errors, and what growth is made of
+            total += peak_bytes(self.image) + 4 * maps * (LABELS_AT_ONCE * band.rows * band.cols + rows * self.cols)
+            total += self.n_cameras * in_rows * in_cols * HIDING_BYTES
         # One frame and one unit are worked on, and one unit is being written.
         return total + (1 + ahead) * block + (2 + WRITE_BEHIND) * unit
+
+    def _band(self, rows: int) -> Band:
+        """Two more rows and columns for the growth at the edges, and for the start of a refinement there."""
+        cols = self.tile_cols or self.cols + 2
+        return Band.of(self.problem.sampling, rows + 2, cols, int(self.config.window.stride))
 
     def _refining(self, refine: Refinement, itemsize: int, gpu: bool) -> int:
         """Workspaces of the pixels that are refined at once."""
@@ -114,6 +136,8 @@ def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int,
             chosen = min(int(plan.tile), rows)
         else:
             chosen = int(np.clip(BAND_PIXELS // demand.cols, 16, rows)) if rows > 16 else rows
+            if demand.tile_cols:
+                chosen = min(rows, demand.tile_cols)
             while chosen > 1 and not (demand.bytes(chosen, ahead) <= limit and indexed(chosen)):
                 chosen = max(1, chosen * 3 // 4)
             # Bands of equal height: the last one should not be a sliver.

@@ -11,18 +11,19 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from leafflow_ti.config_sections import (
-    Auto,
     FiltersSection,
     ModelSection,
     OutputSection,
     PlanSection,
+    Preshift,
     RangeFlowSection,
     RefineSection,
+    SearchSection,
     Section,
     WindowSection,
 )
@@ -43,16 +44,22 @@ Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 
 
 class RunConfig(Section):
-    """A whole run. A preset decides ``precision`` unless it is given itself, and what ``resolve`` does."""
+    """A whole run.
+
+    ``preshift``: whole pixels per camera step; ``uniform``: found in the images; ``adaptive``: what a search of every
+    frame finds for each pixel, whole-pixel motion included; ``auto``: uniform where that serves nearly all of the
+    images, else adaptive. A preset decides ``precision`` unless it is given itself, and what ``resolve`` does.
+    """
 
     preset: Preset = "balanced"
     precision: Precision = "f32"
     arch: Arch = "auto"
-    preshift: tuple[int, int] | Auto = "auto"
+    preshift: tuple[int, int] | Preshift = "auto"
     model: ModelSection = ModelSection()
     window: WindowSection = WindowSection()
     filters: FiltersSection = FiltersSection()
     range_flow: RangeFlowSection = RangeFlowSection()
+    search: SearchSection = SearchSection()
     refine: RefineSection = RefineSection()
     plan: PlanSection = Field(default_factory=PlanSection)
     output: OutputSection = OutputSection()
@@ -68,9 +75,9 @@ class RunConfig(Section):
     @field_validator("preshift", mode="before")
     @classmethod
     def _check_preshift(cls, value: object) -> object:
-        if value == "auto":
+        if value in get_args(Preshift):
             return value
-        x, *y = numbers(value, (1, 2), 'X or X,Y per camera step, or "auto"')
+        x, *y = numbers(value, (1, 2), f"X or X,Y per camera step, or one of {', '.join(get_args(Preshift))}")
         return (x, *y) if y else (x, 0)
 
     def to_toml(self) -> str:
@@ -97,6 +104,7 @@ KEYWORDS: dict[str, str] = {
     **{name: f"window.{name}" for name in WindowSection.model_fields if name != "size"},
     **{name: f"filters.{name}" for name in FiltersSection.model_fields},
     **{name: f"range_flow.{name}" for name in RangeFlowSection.model_fields},
+    **{name: f"search.{name}" for name in SearchSection.model_fields},
     "refine": "refine.steps",
     "refine_window": "refine.window",
     "thin": "refine.thin",

@@ -9,7 +9,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
-from leafflow_ti.config_values import auto_or_integer, integer, machine_memory, noise_or_auto, numbers, parse_memory
+from leafflow_ti.config_values import (
+    auto_or_integer,
+    increasing,
+    integer,
+    machine_memory,
+    noise_or_auto,
+    numbers,
+    parse_memory,
+    positive_or_auto,
+)
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
 from leafflow_ti.filters import MAX_BLUR
@@ -38,6 +47,7 @@ SIGMA_PER_SIZE = 19.0 / 65.0
 """Gaussian width relative to the window size in the dissertation's experiments (65 pixels, sigma 19)."""
 
 Auto = Literal["auto"]
+Preshift = Literal["auto", "uniform", "adaptive"]
 _Taps = Annotated[Literal["3x1x1", "3", "5", "7"], BeforeValidator(str)]
 _AutoTaps = Annotated[Literal["auto", "3x1x1", "3", "5", "7"], BeforeValidator(str)]
 _AutoOdd = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 1, odd=True))]
@@ -45,6 +55,7 @@ _AutoCount = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 
 _AutoSteps = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 0, high=50))]
 _AutoDegree = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 5, odd=True, high=7))]
 _AutoRefined = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, REFINED_WINDOW, odd=True))]
+_AutoRange = Annotated[tuple[float, float] | Auto, BeforeValidator(increasing)]
 _Noise = Annotated[float | Auto, BeforeValidator(noise_or_auto)]
 _Width = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -146,6 +157,15 @@ class RangeFlowSection(Section):
     constraint: Constraint = "taylor"
     beta: _Width = 1.0
     depth: str | None = None
+
+
+class SearchSection(Section):
+    """The coarse search where no single whole-pixel shift serves: lowest and highest disparity ``A,B`` as seen in the
+    images [px per step along the main axis, that is x where there are columns], and the largest motion along x or y
+    [px/frame]. "auto" finds the one, and searches up to 24 for the other."""
+
+    disparity_range: _AutoRange = "auto"
+    motion_range: Annotated[float | Auto, BeforeValidator(positive_or_auto)] = "auto"
 
 
 class RefineSection(Section):

@@ -61,14 +61,40 @@ def auto_or_integer(value: object, low: int, odd: bool = False, high: int | None
         raise ValueError(f'{error}, or "auto"') from None
 
 
+def positive_or_auto(value: object) -> object:
+    """A positive number, or ``"auto"``; else ValueError."""
+    if value == "auto":
+        return value
+    number = _number(value)
+    if not 0 < number < math.inf:
+        raise ValueError('must be a number > 0, or "auto"')
+    return number
+
+
+def increasing(value: object) -> object:
+    """Two increasing numbers of ``"1,2.5"`` or ``[1, 2.5]``, or ``"auto"``; else ValueError."""
+    if value == "auto":
+        return value
+    parts = value.split(",") if isinstance(value, str) else value
+    found = tuple(map(_number, parts)) if isinstance(parts, list | tuple) else ()
+    if len(found) != 2 or not -math.inf < found[0] < found[1] < math.inf:
+        raise ValueError('must be two increasing numbers A,B, or "auto"')
+    return found
+
+
+def _number(value: object) -> float:
+    """A number as people write it; else NaN."""
+    try:
+        return float(str(value))
+    except ValueError:
+        return math.nan
+
+
 def noise_or_auto(value: object) -> object:
     """A standard deviation in grey values, or ``"auto"``; else ValueError."""
     if value == "auto":
         return value
-    try:
-        number = float(str(value))
-    except ValueError:
-        number = math.nan
+    number = _number(value)
     if not 0 <= number < math.inf:
         raise ValueError('must be a number of grey values >= 0, or "auto"')
     return number

@@ -44,7 +44,7 @@ class Engine:
         problem, filters = plan.problem, plan.config.filters
         key = (
             device, replace(problem, noise=0.0), plan.layout, band, plan.differences, filters.prefilter,
-            filters.sigma_pre, apart, plan.refine, (plan.geometry, plan.preshift) if plan.refine else None,
+            filters.sigma_pre, apart, plan.refine,
         )  # fmt: skip
         kept = _take(key)
         if kept is not None and not plan.ranges:

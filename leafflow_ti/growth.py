@@ -52,9 +52,17 @@ class Differences:
     backward: NDArray[np.bool_]
 
     @classmethod
-    def over(cls, known: NDArray[np.bool_], axis: int, step: int) -> Differences:
-        """Differences between pixels that are ``known``, ``step`` pixels apart."""
+    def over(
+        cls, known: NDArray[np.bool_], axis: int, step: int, joined: NDArray[np.bool_] | None = None
+    ) -> Differences:
+        """Differences between pixels that are ``known``, ``step`` pixels apart.
+
+        ``joined`` [h - 1, w] or [h, w - 1]: which neighbours lie on one surface; None: all.
+        """
         forward, backward = (_moved(known, axis, by, False) & known for by in (1, -1))
+        if joined is not None:
+            forward &= np.pad(joined, [(0, int(a == axis)) for a in (0, 1)])
+            backward &= np.pad(joined, [(int(a == axis), 0) for a in (0, 1)])
         return cls(axis, step, forward, backward)
 
     @property
@@ -87,17 +95,19 @@ def growth_maps(
     f_px: float,
     principal_px: tuple[float, float],
     sampling: Sampling,
+    joined: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
 ) -> dict[str, Array]:
     """``growth_rate`` and ``growth_rate_std`` [h, w] in %/frame.
 
     ``maps``: those of ``INPUTS`` [h, w] at the pixels ``y``, ``x``, NaN where there is no value. ``sampling`` holds
-    the windows along y and x.
+    the windows along y and x. ``joined``: which pixels lie on one surface with the one below, and to the right.
     """
     depth, *given = (np.asarray(maps[name], np.float64) for name in INPUTS)
     velocity, packed = given[:3], (given[3:9], given[9:])
     known = np.isfinite(depth) & np.isfinite(velocity).all(axis=0)
     ray = ((np.array(x) - principal_px[0]) / f_px, ((np.array(y) - principal_px[1]) / f_px)[:, None], 1.0)
-    across, down = Differences.over(known, 1, x.step), Differences.over(known, 0, y.step)
+    below, beside = joined or (None, None)
+    across, down = Differences.over(known, 1, x.step, beside), Differences.over(known, 0, y.step, below)
     a, b = ([d.of(depth * r) for r in ray] for d in (across, down))
     p, q = ([d.of(v) for v in velocity] for d in (across, down))
     ends = [_element(a, b, p, q, half) for half in (0.5, -0.5)]

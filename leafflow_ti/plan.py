@@ -9,8 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from leafflow_ti.bands import READ_AHEAD, Demand, choose_bands, usable_memory
-from leafflow_ti.capture import DEFAULT_CACHE_BYTES, ArrayCapture, Capture, Geometry, find_preshift
+from leafflow_ti.bands import READ_AHEAD, TILE_PIXELS, Demand, choose_bands, usable_memory
+from leafflow_ti.capture import (
+    DEFAULT_CACHE_BYTES,
+    ArrayCapture,
+    Capture,
+    Geometry,
+    UnclearDisparity,
+    find_preshift,
+    one_preshift_serves,
+)
 from leafflow_ti.config import RunConfig, resolve
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import MOTION_NAMES, QUANTITIES, with_std
@@ -61,6 +69,14 @@ class Plan:
     """Standard deviation of the noise of the (prefiltered) images of the reference camera."""
     ranges: RangePlan | None = None
     refine: Refinement | None = None
+    tile_cols: int = 0
+    """Output columns of a tile where every frame is searched for what whole-pixel shift each pixel needs; 0: one
+    ``preshift`` serves all."""
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the images are shifted by what a search of every frame finds; ``preshift`` then means nothing."""
+        return self.tile_cols > 0
 
     def reach(self, axis: str) -> int:
         """Pixels that a measurement needs on each side along an image axis."""
@@ -157,6 +173,12 @@ class Plan:
             for t_index in range(len(self.frames)):
                 yield self.unit(t_index, band)
 
+    def _shifts(self) -> str:
+        if self.adaptive:
+            across = self.tile_cols * self.x.step
+            return f"shifted as each pixel's disparity and motion need it, tiles of {across} px"
+        return f"preshift {self.preshift[0]},{self.preshift[1]} px per step"
+
     def describe(self) -> str:
         """The plan in words, one fact a line."""
         problem, sampling = self.problem, self.problem.sampling
@@ -198,8 +220,7 @@ class Plan:
         lines += [
             f"noise       {self.noise:.3g} {unit}, {'given' if known else 'estimated'}",
             f"windows     {'; '.join(axis(a) for a in ('x', 'y', 'sx', 'sy', 't'))}",
-            f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, preshift "
-            f"{self.preshift[0]},{self.preshift[1]} px per step",
+            f"cameras     {len(self.cameras[0])} rows x {len(self.cameras[1])} columns, {self._shifts()}",
             f"frames      {self.frames[0]}..{self.frames[-1]} ({len(self.frames)})",
             f"output      {len(self.y)} x {len(self.x)} pixels per frame, stride {self.x.step}: "
             f"{', '.join(self.names)}",
@@ -240,17 +261,18 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         )
     motion = fitted_motion(config, name)
     preshift, ranges, noise = (0, 0), None, noise_level(capture, config)
+    adaptive = False
     if model.ranges:
         depth = None if config.range_flow.depth else model_problem(capture, static(config), "depth", None)
         own = replace(depth, noise=noise) if depth else None
-        preshift = _preshift(capture, config) if own else (0, 0)
+        preshift = _uniform(capture, config) if own else (0, 0)
         alone = sampling_of(capture, config, "reference", True)
         frames = _frames(capture, config, alone.t.radius, True)
         problem, ranges = range_problem(capture, config, alone, frames, own, preshift, noise)
     else:
         problem = model_problem(capture, config, name, motion)
         frames = _frames(capture, config, problem.sampling.t.radius, model.time)
-        preshift = _preshift(capture, config) if problem.camera_axes else (0, 0)
+        preshift, adaptive = _preshift(capture, config, bool(problem.camera_axes), model.time)
     problem = replace(problem, noise=noise)
     layout = TensorLayout.of(problem.columns)
     x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
@@ -275,9 +297,15 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     )  # fmt: skip
     depths = (0,) if isinstance(capture, ArrayCapture) else range(READ_AHEAD, -1, -1)
     demand = Demand(config, problem, layout, ranges, refine, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))
+    if adaptive:
+        demand = replace(
+            demand, tile_cols=min(len(x), -(-TILE_PIXELS // stride)), image=(capture.height, capture.width)
+        )
     band_rows, memory, ahead = choose_bands(demand, len(y), depths)
-    plan = replace(plan, band_rows=band_rows, bytes=memory, read_ahead=ahead)
-    cache = capture.cacheable_bytes if plan.bands > 1 else 0
+    plan = replace(plan, band_rows=band_rows, bytes=memory, read_ahead=ahead, tile_cols=demand.tile_cols)
+    cache = capture.cacheable_bytes if plan.bands > 1 or adaptive else 0
+    if adaptive:  # of the frames that one measurement needs: they come again for every tile and label
+        cache = cache * min(capture.n_frames, 2 * problem.sampling.t.radius + 2) // capture.n_frames
     if cache > min(DEFAULT_CACHE_BYTES, usable_memory(config) - memory):
         cache = 0
     return replace(plan, bytes=memory + cache, cache_bytes=cache)
@@ -301,6 +329,20 @@ def _geometry(capture: Capture) -> Geometry:
     return capture.geometry or Geometry(1.0, centre)
 
 
-def _preshift(capture: Capture, config: RunConfig) -> tuple[int, int]:
-    found = find_preshift(capture) if config.preshift == "auto" else config.preshift
+def _uniform(capture: Capture, config: RunConfig) -> tuple[int, int]:
+    """The whole-pixel disparity that all images are shifted by."""
+    found = find_preshift(capture) if isinstance(config.preshift, str) else config.preshift
     return (found[0] if capture.n_cols > 1 else 0, found[1] if capture.n_rows > 1 else 0)
+
+
+def _preshift(capture: Capture, config: RunConfig, cameras: bool, time: bool) -> tuple[tuple[int, int], bool]:
+    """The whole-pixel disparity that all images are shifted by; or that each pixel needs its own, and its motion."""
+    if config.preshift == "adaptive":
+        return (0, 0), True
+    try:
+        found = _uniform(capture, config) if cameras else (0, 0)
+    except UnclearDisparity:
+        if config.preshift != "auto":
+            raise
+        return (0, 0), True
+    return found, config.preshift == "auto" and not one_preshift_serves(capture, found, time)

@@ -23,7 +23,7 @@ from leafflow_ti.capture import Capture
 from leafflow_ti.ceilings import Ceilings, measure_ceilings
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError
-from leafflow_ti.pipeline import Maps, Pipeline
+from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan, Unit, make_plan
 from leafflow_ti.refine_plan import Effort
 from leafflow_ti.refine_work import count_refinement
@@ -31,6 +31,7 @@ from leafflow_ti.results import ResultStore
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.tensor import Band
+from leafflow_ti.stays import Maps
 from leafflow_ti.trace import BACKGROUND_STAGES, STAGES, Event, Trace, active, span
 from leafflow_ti.work import Rate, Work, count_work, rate
 

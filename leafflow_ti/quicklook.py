@@ -37,6 +37,7 @@ STATUS_COLOURS: dict[Status, str] = {
     Status.MASKED: "#1f1f24",
     Status.NOT_FINITE: "#e88fb0",
     Status.UNREFINED: "#5b9bd0",
+    Status.CONTESTED: "#c9a86a",
     Status.NOT_COMPUTED: "#f7f7f7",
 }
 """Colour of each status in the pictures."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.aim import Aim
 from leafflow_ti.background import prepared
 from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import read_gray
@@ -50,21 +51,25 @@ class Reader:
         self.mask = _read_mask(plan.config.output.mask, capture)
 
     def blocks(
-        self, frames: range, box: Box, ahead: int | None = None
+        self, frames: range, box: Box, aim: Aim, around: int = 0, ahead: int | None = None
     ) -> Generator[tuple[NDArray[Any], Mask], None, None]:
         """For each frame the block [sy, sx, rows, cols], 0 where not finite, and where it is finite.
 
-        ``ahead``: how many frames are read before they are asked for; default: as planned.
+        ``around``: the reference frame, from which ``aim`` counts; ``ahead``: how many frames are read before they are
+        asked for; default: as planned.
         """
         depth = self.plan.read_ahead if ahead is None else ahead
-        return prepared(partial(self._prepare, box), frames, depth, self.threads)
+        return prepared(partial(self._prepare, box, aim, around), frames, depth, self.threads)
 
-    def _prepare(self, box: Box, t: int) -> tuple[tuple[NDArray[Any], Mask], list[Callable[[], None]]]:
+    def _prepare(
+        self, box: Box, aim: Aim, around: int, t: int
+    ) -> tuple[tuple[NDArray[Any], Mask], list[Callable[[], None]]]:
         """An empty block of one frame, and the work that fills it."""
         sy, sx = self.plan.cameras
+        x, y = aim.offset(t - around)
         block = np.zeros((len(sy), len(sx), box.rows, box.cols), self.dtype)
         finite = np.ones(block.shape, bool)
-        fills = self.capture.fills(block[None], [t], sy, sx, box.y, box.x, self.plan.preshift)
+        fills = self.capture.fills(block[None], [t], sy, sx, box.y + y, box.x + x, aim.shift)
         images = (array.reshape(-1, box.rows, box.cols) for array in (block, finite))
         whole = self.capture.finite
         pieces: list[Callable[[], None]] = [
@@ -72,19 +77,21 @@ class Reader:
         ]
         return (block, finite), pieces
 
-    def seen(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> tuple[Mask, Mask]:
-        """Which rows ``y`` [cameras along y, n] and columns ``x`` [cameras along x, n] of blocks lie inside images."""
-        capture, shift = self.capture, self.plan.preshift
+    def seen(self, box: Box, aim: Aim, frames: int = 0) -> tuple[Mask, Mask]:
+        """Which rows [cameras along y, rows] and columns [cameras along x, cols] of a block lie inside the images.
+
+        ``frames`` from the reference."""
+        capture, shift, offset = self.capture, aim.shift, aim.offset(frames)
         rows, cols = (
             np.array(cameras)[:, None] - n for cameras, n in zip(self.plan.cameras, capture.reference, strict=True)
         )
-        in_y, in_x = y + shift[1] * rows, x + shift[0] * cols
+        in_y = box.y + offset[1] + np.arange(box.rows) + shift[1] * rows
+        in_x = box.x + offset[0] + np.arange(box.cols) + shift[0] * cols
         return (in_y >= 0) & (in_y < capture.height), (in_x >= 0) & (in_x < capture.width)
 
-    def inside(self, box: Box) -> Mask:
+    def inside(self, box: Box, aim: Aim, frames: int = 0) -> Mask:
         """Where every camera sees its image and the mask allows a measurement: [rows, cols]."""
-        y, x = box.y + np.arange(box.rows), box.x + np.arange(box.cols)
-        in_y, in_x = (np.logical_and.reduce(seen) for seen in self.seen(y, x))
+        in_y, in_x = (np.logical_and.reduce(seen) for seen in self.seen(box, aim, frames))
         inside = in_y[:, None] & in_x
         kept = self.masked(box)
         return np.asarray(inside if kept is None else inside & kept)
@@ -96,15 +103,15 @@ class Reader:
         capture, y, x = self.capture, box.y + np.arange(box.rows), box.x + np.arange(box.cols)
         return self.mask[np.clip(y, 0, capture.height - 1)[:, None], np.clip(x, 0, capture.width - 1)]
 
-    def require_positive(self, block: NDArray[Any], valid: Mask, t: int, box: Box) -> None:
+    def require_positive(self, block: NDArray[Any], valid: Mask, t: int, box: Box, aim: Aim, around: int = 0) -> None:
         """Raise InputError for the first valid grey value of a block that has no logarithm."""
         wrong = valid & (block <= 0)
         if not wrong.any():
             return
         j, k, row, col = (int(n) for n in np.argwhere(wrong)[0])
         sy, sx = self.plan.cameras[0][j], self.plan.cameras[1][k]
-        x = box.x + col + self.plan.preshift[0] * (sx - self.capture.reference[1])
-        y = box.y + row + self.plan.preshift[1] * (sy - self.capture.reference[0])
+        shift = aim.offset(t - around, (sx - self.capture.reference[1], sy - self.capture.reference[0]))
+        x, y = box.x + col + shift[0], box.y + row + shift[1]
         raise InputError(
             f"{self.capture.image_name(t, sy, sx)}: grey value {block[j, k, row, col]:g} at pixel x = {x}, y = {y}: "
             "prefilter homomorphic takes logarithms and needs values above 0: choose prefilter highpass, or add an "

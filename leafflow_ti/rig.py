@@ -22,13 +22,13 @@ from leafflow_ti.expected import Array, ExpectedTexture, Spectrum, flow_paramete
 from leafflow_ti.field import MOTION_NAMES, STRAIN_NAMES
 from leafflow_ti.growth import INPUTS, growth_maps
 from leafflow_ti.models import ColumnSet, TensorLayout
-from leafflow_ti.pipeline import plane_of
 from leafflow_ti.plan import Plan, make_plan
 from leafflow_ti.refine_plan import Refinement
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.splines import PREFILTER_SIGMA
 from leafflow_ti.stages.estimate import EstimateStage, View
 from leafflow_ti.stages.problem import Problem
+from leafflow_ti.stays import plane_of
 from leafflow_ti.synthetic.exact_flow import flow_parameters, preshifted_flow_parameters
 from leafflow_ti.synthetic.geometry import plane_axes
 from leafflow_ti.synthetic.moving_patch import Views, directions, pulled_back, window

@@ -20,6 +20,7 @@ class Status(IntEnum):
     MASKED = 6
     NOT_FINITE = 7
     UNREFINED = 8
+    CONTESTED = 9
     NOT_COMPUTED = 255
 
 
@@ -34,9 +35,10 @@ ADVICE: dict[Status, str] = {
     Status.NOT_FINITE: "the images hold NaN or infinite grey values here",
     Status.UNREFINED: "the exact refinement did not converge, fitted no better, or would mix surfaces that a robust "
     "estimate told apart: the values are those before it",
+    Status.CONTESTED: "two surfaces meet here: the values are those of the one that explains the images better",
     Status.NOT_COMPUTED: "not computed yet, or outside the region of interest",
 }
 """One sentence of advice for each status."""
 
-HAS_VALUE = (Status.OK, Status.APERTURE, Status.UNREFINED)
+HAS_VALUE = (Status.OK, Status.APERTURE, Status.UNREFINED, Status.CONTESTED)
 """Codes whose maps hold numbers."""

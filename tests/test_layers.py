@@ -38,7 +38,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
     **dict.fromkeys(("growth", "refinement", "identify"), 5),
-    **dict.fromkeys(("bands", "model_plan", "plan", "reading", "engines", "pipeline", "results", "work"), 6),
+    **dict.fromkeys(("search", "bands", "model_plan", "plan", "reading", "engines", "pipeline", "results", "work"), 6),
     **dict.fromkeys(("refinement", "refine_work"), 6),
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
     **dict.fromkeys(("expected",), 6),

@@ -12,7 +12,8 @@ from leafflow_ti.capture.capture import (
 from leafflow_ti.capture.channels import ImageInfo
 from leafflow_ti.capture.description import Camera, Description, Grid, Images, Time, write_description
 from leafflow_ti.capture.images import probe, read_gray
-from leafflow_ti.capture.preshift import find_preshift
+from leafflow_ti.capture.preshift import UnclearDisparity, find_preshift
+from leafflow_ti.capture.spread import one_preshift_serves
 
 __all__ = [
     "DEFAULT_CACHE_BYTES",
@@ -26,8 +27,10 @@ __all__ = [
     "ImageInfo",
     "Images",
     "Time",
+    "UnclearDisparity",
     "capture_from_array",
     "find_preshift",
+    "one_preshift_serves",
     "open_capture",
     "probe",
     "read_gray",

@@ -31,6 +31,10 @@ _Image = npt.NDArray[np.float64]
 _WAY_OUT = "give it with --preshift X,Y"
 
 
+class UnclearDisparity(InputError):
+    """Neighbouring cameras do not show the same at any one shift."""
+
+
 def find_preshift(capture: Capture) -> tuple[int, int]:
     """Integer disparity ``(nx, ny)`` [px/step] that leaves the smallest residual; 0 along an axis without grid.
 
@@ -70,7 +74,7 @@ def _neighbour_peak(capture: Capture, axis: str, load: Callable[[_Key], _Image])
     peaks = _maxima(curve)
     height = curve[peaks].max(initial=0.0)
     if height < _CLEAR:
-        raise InputError(
+        raise UnclearDisparity(
             f"no clear disparity along {axis}: neighbours correlate by {height:.2f}, {_CLEAR} is needed: {_WAY_OUT}"
         )
     itself = _correlation(load, ((one, one) for one, _ in _pairs(capture, axis, 1)))
@@ -83,7 +87,7 @@ def _neighbour_peak(capture: Capture, axis: str, load: Callable[[_Key], _Image])
         )
     peak = int(peaks[np.argmax(curve[peaks])])
     if not _in_front(capture, axis, peak - zero):
-        raise InputError(
+        raise UnclearDisparity(
             f"images shift by {peak - zero:+d} px per step along {axis}, against the sign of baseline_mm: "
             f"correct the baseline's sign or the order of the cameras, or {_WAY_OUT}"
         )

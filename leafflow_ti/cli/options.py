@@ -118,7 +118,20 @@ Frames = Annotated[str | None, _text("frames", "A:B", "Frame indices to measure,
 Roi = Annotated[str | None, _text("roi", "x0,y0,x1,y1", "Pixels to measure, x1 and y1 excluded [all].")]
 Mask = Annotated[str | None, _text("mask", "FILE", "Image whose zero pixels are left out.")]
 Preshift = Annotated[
-    str | None, _text("preshift", "auto|X[,Y]", "Disparity per camera step taken out beforehand, whole pixels [auto].")
+    str | None,
+    _text(
+        "preshift",
+        "auto|uniform|adaptive|X[,Y]",
+        "Disparity per camera step taken out beforehand, whole pixels: given, found, or for every pixel (with motion) "
+        "[auto].",
+    ),
+]
+DisparityRange = Annotated[
+    str | None,
+    _text("disparity-range", "auto|A,B", "Disparities that the search looks at, px per step [auto]."),
+]
+MotionRange = Annotated[
+    str | None, _text("motion-range", "auto|PX", "Largest motion that the search looks at, px/frame [auto: 24].")
 ]
 Precision = Annotated[str | None, _text("precision", "f32|f64", "Floating-point numbers of the kernels [f32].")]
 Arch = Annotated[str | None, _text("arch", "auto|cpu|cuda|vulkan|metal", "Device [auto].")]
@@ -137,6 +150,7 @@ SETTINGS: dict[str, Any] = {
     "weighting": Weighting, "noise": Noise, "window": Window, "sigma": Sigma, "stride": Stride, "border": Border,
     "refine": Refine, "refine_window": RefineWindow, "thin": Thin, "taps": Taps, "blur": Blur, "prefilter": Prefilter,
     "sigma_pre": SigmaPre, "frames": Frames, "roi": Roi, "mask": Mask, "preshift": Preshift,
+    "disparity_range": DisparityRange, "motion_range": MotionRange,
     "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads,
 }  # fmt: skip
 """Keyword of the configuration -> its option."""

@@ -139,6 +139,13 @@ FIELDS: dict[str, tuple[str, Callable[[str, Any], Any]]] = {
     "light_target_mm": ("light_target_mm", _numbers(3)),
     "light_cone_deg": ("light_cone", _degrees),
     "ambient_share": ("ambient_share", _keep),
+    # leaves
+    "leaves": ("leaves", _keep),
+    "disparity_px": ("disparity_px", _numbers(2)),
+    "motion_px": ("motion_px", _keep),
+    "wavelength_px": ("wavelengths_px", _pair),
+    "light_change": ("light_change", _numbers(3)),
+    "layout_seed": ("layout_seed", _keep),
 }
 """Parameter of a command -> field of the scene and how the value is read."""
 
@@ -308,16 +315,67 @@ def cube(
     _write(CubeScene(), context.params)
 
 
+@app.command("leaves", short_help="Leaves at several depths over a ground, each moving.", no_args_is_help=False)
+def leaves(
+    context: typer.Context,
+    folder: Folder,
+    cameras: Cameras = None,
+    rows: Rows = None,
+    frames: Frames = None,
+    size: Annotated[str, _option("size", "WxH", "Image size in pixels [401x301].")] = "401x301",
+    noise: Noise = None,
+    seed: Seed = None,
+    bits: Bits = "8",
+    interval_s: Interval = None,
+    focal_px: Annotated[float | None, _option("focal-px", "PX", "Focal length in pixels [1200].")] = None,
+    principal_px: Principal = None,
+    baseline_mm: Annotated[str | None, _option("baseline-mm", "X[,Y]", "Camera step in mm [5].")] = None,
+    leaves: Annotated[int | None, _option("leaves", "N", "Leaves, 1 to 20 [5].")] = None,
+    disparity_px: Annotated[
+        str | None,
+        _option(
+            "disparity-px", "MIN,MAX", "Size of the disparity of the ground and of the nearest leaf, px/step [3,30]."
+        ),
+    ] = None,
+    motion_px: Annotated[
+        float | None, _option("motion-px", "PX", "Motion of the fastest leaf's centre, px/frame [8].")
+    ] = None,
+    light_change: Annotated[
+        str | None,
+        _option(
+            "light-change",
+            "G,GX,GY",
+            "Growth of the logarithm of the light, G + GX X/Z + GY Y/Z per frame [.01,.06,-.03].",
+        ),
+    ] = None,
+    offset: Annotated[float | None, _option("offset", "GREY", "Mean grey value, of 8 bits [110].")] = None,
+    contrast: Annotated[float | None, _option("contrast", "GREY", "Standard deviation of the textures [26].")] = None,
+    wavelength_px: Annotated[
+        str | None, _option("wavelength-px", "MIN,MAX", "Wavelengths of the textures in the middle image, px [5,24].")
+    ] = None,
+    layout_seed: Annotated[
+        int | None, _option("layout-seed", "N", "Seed of the leaves and their textures [1].")
+    ] = None,
+    supersampling: Annotated[int | None, _option("supersampling", "N", "Rays per pixel: N x N [2].")] = None,
+) -> None:
+    """Tilted leaves at several depths that hide each other and the ground, each with its own motion, in changing light.
+
+    truth.npz labels them: 0 the ground, leaves from 1, farthest first.
+    """
+    from leafflow_ti.synthetic.leaves import LeavesScene
+
+    _write(LeavesScene(), context.params)
+
+
 def _write(default: Scene, params: Mapping[str, Any]) -> None:
     """Write the scene ``default``, changed by the options that were given."""
     from leafflow_ti.synthetic.write import write_scene
 
     given = {name: value for name, value in params.items() if value not in (None, [], ())}
     changes = {FIELDS[name][0]: FIELDS[name][1](_flag(name), given[name]) for name in given if name in FIELDS}
-    x, y, z = default.centre
-    if "centre_mm" in given:
-        x, y = _numbers(2)("--centre-mm", given["centre_mm"])
-    scene = replace(default, **changes, centre=(x, y, given.get("depth_mm", z)))
+    if "centre_mm" in given or "depth_mm" in given:
+        changes["centre"] = _centre(default, given)
+    scene = replace(default, **changes)
     folder: Path = given["folder"]
     write_scene(scene, folder, given.get("interval_s"), _show_progress if sys.stderr.isatty() else None)
     typer.echo(
@@ -325,11 +383,28 @@ def _write(default: Scene, params: Mapping[str, Any]) -> None:
         f"{scene.size[0]} x {scene.size[1]} px, {scene.bits or 'float'}{' bits' if scene.bits else ''}; "
         f"capture.toml, truth.npz (frame {scene.reference_frame})"
     )
-    counts = (scene.n_cols, scene.n_rows)
-    shift = [round(-scene.f_px * b / scene.centre[2]) * (n > 1) for b, n in zip(scene.baseline_mm, counts, strict=True)]
+    shift = _whole_disparity(scene)
     if any(shift):
         # Periodic textures hide it from a search.
         typer.echo(f"disparity at the centre in whole pixels: --preshift {shift[0]},{shift[1]}")
+
+
+def _centre(default: Scene, given: Mapping[str, Any]) -> tuple[float, float, float]:
+    """The centre of the scene's one object, changed by the options that were given."""
+    x, y, z = default.centre  # type: ignore[union-attr]  # scenes without have no such options
+    if "centre_mm" in given:
+        x, y = _numbers(2)("--centre-mm", given["centre_mm"])
+    return x, y, given.get("depth_mm", z)
+
+
+def _whole_disparity(scene: Scene) -> tuple[int, int]:
+    """Disparity (x, y) [px/step] of the centre of the scene's one object; 0 if it has several."""
+    centre = getattr(scene, "centre", None)
+    if centre is None:
+        return 0, 0
+    counts = (scene.n_cols, scene.n_rows)
+    nx, ny = (round(-scene.f_px * b / centre[2]) * (n > 1) for b, n in zip(scene.baseline_mm, counts, strict=True))
+    return nx, ny
 
 
 def _flag(name: str) -> str:

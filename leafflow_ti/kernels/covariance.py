@@ -72,11 +72,11 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
                     at = target + (column * n_rows + c * offsets) * p.stride
                     ws[at] = ws[at] + shift * value[p.v + Value.SCALE + column]
         for term in range(number[p.n + Number.CENTRE_TERMS]):
-            constant, square = number[p.n + Number.CENTRE + 2 * term], number[p.n + Number.CENTRE + 2 * term + 1]
-            share = value[p.v + Value.CENTRE + term] * value[p.v + Value.SCALE + square]
+            column, other = number[p.n + Number.CENTRE + 2 * term], number[p.n + Number.CENTRE + 2 * term + 1]
+            share = value[p.v + Value.CENTRE + term] * value[p.v + Value.SCALE + other]
             for c in range(n_rows):
-                if number[p.n + rows_at + c] == constant:
-                    ws[target + (square * n_rows + c) * p.stride] = V(share)
+                if number[p.n + rows_at + c] == column:
+                    ws[target + (other * n_rows + c) * p.stride] = V(share)
         small.solve(ws, region(p, number, Region.CLEAN), target, flow, n_rows, p.stride)
 
     @ti.func

@@ -25,7 +25,7 @@ begin to grow."""
 
 @functools.cache
 def identify_functions(spec: KernelSpec) -> SimpleNamespace:
-    """``admit``, and ``at_centre``, which makes parameters of constants values at the window's centre."""
+    """``admit``, and ``at_centre``, which makes parameters values at the window's centre."""
     V = spec.element
     small, texture = dense(spec), texture_functions(spec)
 
@@ -41,11 +41,12 @@ def identify_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def at_centre(parameters: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
-        """Parameters of constants become values at the window's centre, where centred squares are not 0."""
+        """Parameters at the window's centre, as at a place that stands still: constants where centred squares are not
+        0, derivatives along time without what the shift of the images made of those along x and y."""
         for term in range(number[p.n + Number.CENTRE_TERMS]):
             at = parameters + number[p.n + Number.CENTRE + 2 * term] * p.stride
-            square = parameters + number[p.n + Number.CENTRE + 2 * term + 1] * p.stride
-            ws[at] = ws[at] + ws[square] * value[p.v + Value.CENTRE + term]
+            other = parameters + number[p.n + Number.CENTRE + 2 * term + 1] * p.stride
+            ws[at] = ws[at] + ws[other] * value[p.v + Value.CENTRE + term]
 
     @ti.func
     def ignorance(

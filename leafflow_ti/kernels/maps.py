@@ -256,7 +256,8 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
                 row = k * number[p.n + Number.OFFSETS]
                 column = number[p.n + Number.MOTION_SOLUTION] * flow + number[p.n + Number.FLOW_ROWS + k]
                 variance = ws[rows + tri(row, row) * p.stride]
-                put(Output.FLOW_X + k, ws[found + column * p.stride], variance, p, target, ws)
+                flowing = ws[found + column * p.stride] + value[p.v + Value.MOTION_SHIFT + k]
+                put(Output.FLOW_X + k, flowing, variance, p, target, ws)
             normal_flow(p, number, ws)
         if number[p.n + Number.BRIGHTNESS_COLUMN] >= 0:
             for j in range(number[p.n + Number.CAMERA_SOLUTIONS]):

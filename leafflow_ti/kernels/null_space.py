@@ -338,7 +338,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
         p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
         out: ti.template(),
     ):  # fmt: skip
-        """Parameters of constants become values at the window's centre, where centred squares are not 0."""
+        """Parameters at the window's centre, see ``identify.at_centre``."""
         found = region(p, number, Region.PARAMETERS)
         for j in range(number[p.n + Number.SOLUTIONS]):
             identify.at_centre(found + j * number[p.n + Number.FLOW] * p.stride, p, number, value, ws)

@@ -132,6 +132,8 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
             if r < 2 * offsets:
                 at = parameters + number[p.n + Number.MOTION_ROWS + r] * p.stride
             found = ws[at]
+            if r < 2 * offsets and r % offsets == 0:
+                found = found + value[p.v + Value.MOTION_SHIFT + r // offsets]
             if number[p.n + Number.OWN_FLOW] == 1 and r % offsets == 0:
                 for k in range(2):
                     # Pixels from the preshifted pixel to where the patch point projects.

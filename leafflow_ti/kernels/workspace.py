@@ -17,7 +17,7 @@ MAX_UNKNOWNS = 10
 PATCH_SIZE = 12
 MAX_ROWS = 16
 MAX_COLUMNS = 32
-MAX_SQUARES = 8
+MAX_CENTRE_TERMS = 14
 
 
 class Region(IntEnum):
@@ -229,7 +229,7 @@ class Number(IntEnum):
     BRIGHTNESS_COLUMN = auto()  # column of I, or -1
     BRIGHTNESS_ROWS = auto()  # brightness rows of the motion solution, behind its flow rows
     WORLD_MAPS = auto()  # brightness in world coordinates: 2 along X, Y; 3 with the trend; 0 without slopes
-    CENTRE_TERMS = auto()  # what centred squares add to the value at the window's centre
+    CENTRE_TERMS = auto()  # what other parameters add to some: see ``identify.at_centre``
     NOISE_TERMS = auto()  # terms of each solution's noise beyond the ratios
     CROSS_TERMS = auto()  # per pair (camera solution, motion)
     RANGE_TERM = auto()  # index of t among the geometry terms
@@ -265,8 +265,8 @@ class Number(IntEnum):
     CAMERA_AXIS = CAMERA_ROWS + 2 * MAX_ROWS  # 2: 0 for sx, 1 for sy
     CROSS_AB = CAMERA_AXIS + 2  # 2 x 9 x 3: a, b, moment
     BRIGHTNESS_PLANES = CROSS_AB + 54  # 4: output plane of each brightness row, from BRIGHTNESS_T on
-    CENTRE = BRIGHTNESS_PLANES + 4  # MAX_SQUARES x 2: column of the constant, column of the square
-    MOVE = CENTRE + 2 * MAX_SQUARES  # 2 x 2: columns of the flow's derivatives along x, y
+    CENTRE = BRIGHTNESS_PLANES + 4  # MAX_CENTRE_TERMS x 2: column of a parameter, column of what is added to it
+    MOVE = CENTRE + 2 * MAX_CENTRE_TERMS  # 2 x 2: columns of the flow's derivatives along x, y
     PARTNER = MOVE + 4  # MAX_COLUMNS: column of an own flow for each column of the reference model, or -1
     PLACE = PARTNER + MAX_COLUMNS  # MAX_UNKNOWNS: where each component of the motion stands among the unknowns, or -1
     CONSTANT = PLACE + MAX_UNKNOWNS  # MAX_COLUMNS: 1 for columns without an offset
@@ -283,7 +283,8 @@ class Value(IntEnum):
     PY = auto()
     BASELINE = auto()  # 2
     SHIFT = BASELINE + 2  # 2: disparity that the preshift and the rectification took out, px per step
-    STEP_SIZE = SHIFT + 2  # relative step of the finite differences in the motion fit
+    MOTION_SHIFT = SHIFT + 2  # 2: motion that the images were shifted by, px per frame
+    STEP_SIZE = MOTION_SHIFT + 2  # relative step of the finite differences in the motion fit
     DENOISE = auto()  # share of the gradients' noise that is taken out of J_ff in the covariances
     MODEL_ERROR = auto()  # 7: relative, per offset code of a row, the last one of the range constraint
     TURNING_ERROR = MODEL_ERROR + 7  # of mixed derivatives, per turning
@@ -312,7 +313,7 @@ class Value(IntEnum):
     SCALE = auto()  # MAX_COLUMNS
     NOISE = SCALE + MAX_COLUMNS  # MAX_COLUMNS: C
     CROSS = NOISE + MAX_COLUMNS  # 2 x 9
-    CENTRE = CROSS + 18  # MAX_SQUARES: factors
-    PARTNER = CENTRE + MAX_SQUARES  # MAX_COLUMNS: factor of the noise shared with each column of the reference model
+    CENTRE = CROSS + 18  # MAX_CENTRE_TERMS: factors
+    PARTNER = CENTRE + MAX_CENTRE_TERMS  # MAX_COLUMNS: factors of the noise shared with the reference model
     DIFFERENCE = PARTNER + MAX_COLUMNS  # 2 x 7: by axis and offset code of a row; roots of sampling.difference_variance
     RATIO = DIFFERENCE + 14  # k x packed [F], then k x NOISE_TERMS

@@ -71,6 +71,15 @@ def _solution_noise(
     return [*(ratio[lower] for ratio, _ in found), *values], found[0][1]
 
 
+def _sheared(columns: ColumnSet) -> list[tuple[tuple[int, int], int]]:
+    """Columns along time that images shifted by a motion mix with others: (column, other), the other's axis 0 or 1.
+
+    At x' = x - m Δt a field p + p_x Δx + p_y Δy + p_t Δt has the derivative p_t + m · (p_x, p_y) along time.
+    """
+    pairs = [(columns.index(c, "t"), columns.index(c, o), k) for c in ("x", "y", "i") for k, o in enumerate("xy")]
+    return [((t, other), k) for t, other, k in pairs if t is not None and other is not None]
+
+
 def _packed(a: int, b: int) -> int:
     """Position of an element of a symmetric matrix in its packed lower triangle."""
     r, c = max(a, b), min(a, b)
@@ -106,6 +115,8 @@ class View:
     rows: int
     cols: int
     pitch: int
+    motion_px: tuple[float, float] = (0.0, 0.0)
+    """Motion per frame that the images were shifted by, as ``shift_px`` is disparity."""
 
 
 @dataclass
@@ -160,11 +171,17 @@ class ProblemTables:
             self.tables += [final, *self._own_tables(own)]
         self.raw = len(self.tables)
         if any(move.raw for move in self._estimator.moves(problem.solver)):
-            owners = [columns, columns, *(own.columns for _ in own.steps)] if own else [columns]
             self.tables += [
-                Tables(t.number.copy(), self._unscaled(t.value, c)) for t, c in zip(self.tables, owners, strict=True)
+                Tables(t.number.copy(), self._unscaled(t.value, c))
+                for t, c in zip(self.tables, self._owners(), strict=True)
             ]
         self.set_noise(problem.noise)
+
+    def _owners(self) -> list[ColumnSet]:
+        """Whose columns each of the tables describes."""
+        columns, own = self.problem.columns, self.problem.own_flows
+        owners = [columns, columns, *(own.columns for _ in own.steps)] if own else [columns]
+        return owners * (len(self.tables) // len(owners))
 
     def _rows(self) -> SimpleNamespace:
         """Columns of the motion rows and of each camera solution's geometry rows; brightness rows stand last."""
@@ -208,7 +225,7 @@ class ProblemTables:
         from leafflow_ti.kernels.workspace import Number, Region, Value
 
         problem, precision = self.problem, self.device.algebra
-        noise = column_noise(sampling, columns)
+        noise, sheared = column_noise(sampling, columns), _sheared(columns)
         ratios, terms = _solution_noise(sampling, columns, noise**-0.5)
         number = np.full(Number.LOWER + len(layout.lower) + 2 * len(terms), -1, np.int32)
         value = np.concatenate([np.zeros(Value.RATIO), *ratios])
@@ -219,11 +236,11 @@ class ProblemTables:
             MOTION_SOLUTION=columns.n_time_like - 1 if "t" in columns.solutions else -1, TERMS=len(problem.terms),
             OFFSETS=len(offsets), ROWS_T=len(rows), ROWS_S=0, USE_RANGE=0, UNKNOWNS=0, WEIGHTED=problem.weighted,
             BRIGHTNESS_COLUMN=-1, BRIGHTNESS_ROWS=0, WORLD_MAPS=0, RANGE_TERM=-1, CAMERA_SOLUTIONS=0, CROSS_TERMS=0,
-            OWN_FLOW=0, CORRELATED=0, EXTRA=len(layout.entries), CENTRE_TERMS=len(columns.at_centre),
+            OWN_FLOW=0, CORRELATED=0, EXTRA=len(layout.entries), CENTRE_TERMS=len(columns.at_centre) + len(sheared),
             NOISE_TERMS=len(terms), MOTION_FLOW=len(rows),
         )  # fmt: skip
-        for j, (constant, square, factor) in enumerate(columns.at_centre):
-            number[Number.CENTRE + 2 * j : Number.CENTRE + 2 * j + 2] = constant, square
+        for j, (column, other, factor) in enumerate((*columns.at_centre, *((*pair, 0.0) for pair, _ in sheared))):
+            number[Number.CENTRE + 2 * j : Number.CENTRE + 2 * j + 2] = column, other
             value[Value.CENTRE + j] = factor
         flow_rows = [i for c in ("x", "y") if (i := columns.index(c)) is not None]
         number[Number.FLOW_ROWS : Number.FLOW_ROWS + 2] = flow_rows
@@ -328,12 +345,16 @@ class ProblemTables:
             difference_variance(self.problem.sampling.axis(axis), 2 * view.step, int(offset == axis))
             for axis in ("x", "y") for offset in ("1", *AXES, "range")
         ])  # fmt: skip
-        for tables in self.tables:
+        for tables, columns in zip(self.tables, self._owners(), strict=True):
             self._set_numbers(tables.number, OUT_X=view.x, OUT_Y=view.y, STEP=view.step, PITCH=view.pitch)
             value = tables.value
             value[Value.F], value[Value.PX], value[Value.PY] = view.f_px, *view.principal_px
             value[Value.BASELINE : Value.BASELINE + 2] = view.baseline_mm
             value[Value.SHIFT : Value.SHIFT + 2] = view.shift_px
+            value[Value.MOTION_SHIFT : Value.MOTION_SHIFT + 2] = view.motion_px
+            first = Value.CENTRE + len(columns.at_centre)
+            for n, (_, axis) in enumerate(_sheared(columns)):
+                value[first + n] = -view.motion_px[axis]
             value[Value.DIFFERENCE : Value.DIFFERENCE + 14] = factors
 
     def _with_cells(self, tables: Tables, request: int) -> Tables:

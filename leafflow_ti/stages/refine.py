@@ -76,13 +76,7 @@ class RefineStage:
         self._mask: Any = None
         self._gaps: list[Gaps | None] = [None] * n
         lanes = device.dense.lanes
-        tables = RefineTables.of(plan, view, lanes, self.pitch, device.gpu)
-        self.size = tables.size
-        self._tables = (
-            device.array(tables.size, "int"), device.array(tables.value, "algebra"),
-            device.vectors(device.array(tables.image, "algebra"), lanes),
-        )  # fmt: skip
-        self._samples = device.vectors(device.array(tables.sample), lanes)
+        self.set_view(view)
         storage, algebra = (np.dtype(device.real(kind)).itemsize for kind in ("storage", "algebra"))
         space = Workspaces.of(plan, lanes, (storage, algebra), device.gpu, device.threads)
         self._batch = self._slots_n = space.slots
@@ -92,13 +86,25 @@ class RefineStage:
         self._real = device.zeros(space.slots * space.real * lanes)
         self._precise = device.zeros(space.slots * space.precise * lanes, "algebra")
 
+    def set_view(self, view: View) -> None:
+        """Take images that are shifted in another way, or another camera."""
+        device, lanes = self.device, self.device.dense.lanes
+        tables = RefineTables.of(self.plan, view, lanes, self.pitch, device.gpu)
+        self.size = tables.size
+        self._tables = (
+            device.array(tables.size, "int"), device.array(tables.value, "algebra"),
+            device.vectors(device.array(tables.image, "algebra"), lanes),
+        )  # fmt: skip
+        self._samples = device.vectors(device.array(tables.sample), lanes)
+
     def reset(self) -> None:
         """Forget all frames."""
         self._slots.clear()
         self._next = 0
 
-    def push(self, block: Array, finite: NDArray[np.bool_]) -> None:
-        """Take the next frame: images [sy, sx, rows, cols] and where each is a grey value of an image."""
+    def push(self, block: Array, finite: NDArray[np.bool_], hidden: NDArray[np.bool_] | None = None) -> None:
+        """Take the next frame: images [sy, sx, rows, cols], where each is a grey value of an image, and where it shows
+        something else than the surface (None: nowhere)."""
         from leafflow_ti.kernels.refine_tables import NOTHING
 
         n = len(self.plan.cameras)
@@ -111,7 +117,20 @@ class RefineStage:
                 gaps = self._gaps[k]
                 if gaps is None or not np.array_equal(gaps.valid, valid[k]):
                     self._gaps[k] = gaps = Gaps.of(valid[k], self.pitch, filter_radius(self.plan.degree))
-                self._filter(images[k], gaps, (slot * n + k) * self._plane, NOTHING)
+                at = (slot * n + k) * self._plane
+                self._filter(images[k], gaps, at, NOTHING)
+                if hidden is not None and (beside := hidden.reshape(images.shape)[k]).any():
+                    self._take_out(beside, at, NOTHING)
+
+    def _take_out(self, hidden: NDArray[np.bool_], at: int, nothing: float) -> None:
+        """Let nothing be sampled from where the image shows something else."""
+        if self.device.gpu:
+            plane = self.device.host(self._coefficients)[at : at + self._plane].copy()
+            plane.reshape(self.rows, self.pitch)[:, : self.cols][hidden] = nothing
+            self.device.write(self._coefficients, at, plane)
+        else:
+            plane = self._coefficients[at : at + self._plane].reshape(self.rows, self.pitch)
+            plane[:, : self.cols][hidden] = nothing
 
     def _filter(self, image: Array, gaps: Gaps, to: int, nothing: float) -> None:
         """Spline coefficients of one image; those without a meaning are ``nothing``."""

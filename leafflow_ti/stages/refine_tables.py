@@ -59,7 +59,8 @@ class RefineTables:
         image[Image.TIME, :k] = np.repeat(plan.frames, len(steps))
         for axis in range(2):
             image[Image.CAMERA_X + axis, :k] = np.tile(steps[:, axis] * view.baseline_mm[axis], len(plan.frames))
-            image[Image.SHIFT_X + axis, :k] = np.tile(steps[:, axis] * view.shift_px[axis], len(plan.frames))
+            moved = np.repeat(np.array(plan.frames) * view.motion_px[axis], len(steps))
+            image[Image.SHIFT_X + axis, :k] = np.tile(steps[:, axis] * view.shift_px[axis], len(plan.frames)) + moved
 
         pieces = spline_pieces(plan.degree).ravel()
         value = np.zeros(Value.SPLINE + pieces.size)

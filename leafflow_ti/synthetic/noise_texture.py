@@ -16,12 +16,14 @@ from leafflow_ti.synthetic.geometry import Array
 
 SAMPLES_PER_WAVELENGTH = 40
 MAX_TABLE = 8192
+MOST_FIELDS = 24
+"""Fields that are kept: those of all surfaces of a scene, which are read in turn."""
 
 DARKEST = 1.0
 """Lowest albedo in grey values: no point of a surface is black, logarithms of the images stay finite."""
 
 
-@lru_cache(maxsize=6)
+@lru_cache(maxsize=MOST_FIELDS)
 def noise_texture(seed: tuple[int, ...], period: float, shortest: float, longest: float) -> NDArray[np.float32]:
     """A periodic field [n, n] with mean 0, variance 1 and wavelengths ``shortest``..``longest`` (unit of ``period``).
 

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from leafflow_ti.synthetic import cube, plane
+from types import ModuleType
+
+from leafflow_ti.synthetic import cube, leaves, plane
 from leafflow_ti.synthetic.cube import CubeScene
 from leafflow_ti.synthetic.geometry import Array
+from leafflow_ti.synthetic.leaves import LeavesScene
 from leafflow_ti.synthetic.plane import PlaneScene
 
-Scene = PlaneScene | CubeScene
+Scene = PlaneScene | CubeScene | LeavesScene
+
+_MODULES: dict[type, ModuleType] = {PlaneScene: plane, CubeScene: cube, LeavesScene: leaves}
 
 
 def render_image(scene: Scene, frame: int, row: int, col: int) -> Array:
     """One exposed image [H, W], as of the scene's own module."""
-    if isinstance(scene, PlaneScene):
-        return plane.render_image(scene, frame, row, col)
-    return cube.render_image(scene, frame, row, col)
+    image: Array = _MODULES[type(scene)].render_image(scene, frame, row, col)
+    return image
 
 
 def truth(scene: Scene) -> dict[str, Array]:
     """What the middle camera sees at the middle frame, as of the scene's own module."""
-    return plane.truth(scene) if isinstance(scene, PlaneScene) else cube.truth(scene)
+    maps: dict[str, Array] = _MODULES[type(scene)].truth(scene)
+    return maps

@@ -89,6 +89,23 @@ def shares(columns: ColumnSet):
     return T
 
 
+def unshifted(P, cov, columns: ColumnSet, motion=(0.0, 0.0)):
+    """The same for images that were not shifted by ``motion`` px per frame: p_t = p'_t - m · (p_x, p_y)."""
+    T = np.eye(columns.n_flow)
+    for channel in ("x", "y", "i"):
+        t = columns.index(channel, "t")
+        for m, o in zip(motion, ("x", "y"), strict=True):
+            at = columns.index(channel, o)
+            if t is not None and at is not None:
+                T[t, at] -= m
+    moved = T @ P
+    if "t" in columns.solutions:
+        k = columns.solutions.index("t")
+        for m, channel in zip(motion, ("x", "y"), strict=True):
+            moved[columns.index(channel), k] += m
+    return moved, T @ cov @ T.T
+
+
 def at_centre(P, cov, columns: ColumnSet):
     """Parameters [n_flow, k] and covariances of monomials instead of centred columns: the values at the centre."""
     T = shares(columns)
@@ -208,9 +225,10 @@ class Solved:
                     cov[i, i] += np.outer(bias, bias)
         return cov
 
-    def at_centre(self, columns: ColumnSet, sampling: Sampling, denoise):
-        """Parameters and covariances of monomials, see ``at_centre``."""
-        return at_centre(self.P, self.covariances(columns, sampling, denoise), columns)
+    def at_centre(self, columns: ColumnSet, sampling: Sampling, denoise, motion=(0.0, 0.0)):
+        """Parameters and covariances of monomials, of images that stand still, see ``at_centre``, ``unshifted``."""
+        P, cov = at_centre(self.P, self.covariances(columns, sampling, denoise), columns)
+        return unshifted(P, cov, columns, motion)
 
 
 def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, denoise=0.9):

@@ -217,8 +217,9 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
 
     def own_rows(step, found_own, q):
         flows = problem.own_flows
-        p, s2 = found_own.P, found_own.variance
-        C = found_own.covariances(flows.columns, flows.sampling, denoise)[0, 0]
+        s2 = found_own.variance
+        p, C = found_own.at_centre(flows.columns, flows.sampling, denoise, view.motion_px)
+        C = C[0, 0]
         rows = [flows.columns.index(d, o) for d in ("x", "y") for o in flows.offsets]
         E = np.eye(flows.columns.n_flow)[rows]
         moved = [step[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
@@ -306,7 +307,7 @@ def measure(solved, problem, view, x, y, own=()):
     ``solved``, ``own``: the solution of the reference model, those of every camera's own flow (``chain.Solved``).
     """
     columns, sampling = problem.columns, problem.sampling
-    P, cov = solved.at_centre(columns, sampling, DENOISE[problem.estimator])
+    P, cov = solved.at_centre(columns, sampling, DENOISE[problem.estimator], view.motion_px)
     x0, y0, f = x - view.principal_px[0], y - view.principal_px[1], view.f_px
     found = {}
     for k, axis in enumerate(columns.solutions):

@@ -1,0 +1,251 @@
+"""Units of captures whose disparities or motions no single whole-pixel shift serves.
+
+Each frame is searched coarsely first (``search``). Tiles of the output are then computed once for every label that
+occurs in them (``surfaces``), each pass seeing its own surface alone, and every pixel takes the pass of its label; one
+that has no value there takes that of another label around it which explains its window best. Where surfaces meet, the
+status says ``contested``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leafflow_ti.aim import Aim
+from leafflow_ti.capture import Capture
+from leafflow_ti.field import empty_map
+from leafflow_ti.pipeline import Pipeline
+from leafflow_ti.plan import Plan, Unit
+from leafflow_ti.reading import Mask
+from leafflow_ti.refinement import Place, refine_beyond, refine_maps, ring
+from leafflow_ti.search import Extent, coarse_search
+from leafflow_ti.stages.tensor import Band
+from leafflow_ti.status import HAS_VALUE, Status
+from leafflow_ti.stays import Maps, Stay, without_images
+from leafflow_ti.surfaces import EDGE, REACH, Surfaces, dilated
+from leafflow_ti.trace import span
+
+Codes = NDArray[np.uint8]
+BEYOND = (Status.BORDER, Status.INCOHERENT, Status.NOT_CONVERGED)
+"""Statuses of pixels that the refinement may still have values for: not all images see all of their windows."""
+UNDECIDED = -1
+"""Instead of the number of a label: no pass gave a value."""
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """Part of a band's output pixels: rows and columns of the band, their place in the image, labels in it."""
+
+    rows: slice
+    cols: slice
+    y: range
+    x: range
+    labels: tuple[int, ...]
+
+    @property
+    def place(self) -> tuple[slice, slice]:
+        """Of the tile in the band's maps."""
+        return self.rows, self.cols
+
+
+class Adaptive:
+    """Computes units frame by frame, in the way of a ``Pipeline`` whose plan is adaptive."""
+
+    def __init__(self, pipeline: Pipeline):
+        self.pipeline, self.plan, self.capture = pipeline, pipeline.plan, pipeline.capture
+        margin = 2 * self.plan.margin
+        self._band = Band.of(
+            self.plan.problem.sampling, self.plan.band_rows + margin, self.plan.tile_cols, self.plan.x.step
+        )
+
+    def units(self, t_index: int, bands: Iterable[int]) -> Iterator[tuple[Unit, Maps, Codes]]:
+        """The units of some bands of one frame."""
+        plan, pipeline = self.plan, self.pipeline
+        frame = plan.frames[t_index]
+        with span("search", f"frame {frame}"):
+            surfaces = self._surfaces(frame)
+        edges = surfaces.near_edges()
+        for index in bands:
+            with span("host", f"frame {frame}"):
+                y, x = pipeline.around(index)
+                tiles = self._tiles(y, x, surfaces)
+                maps, codes, chosen = self._measured(tiles, (len(y), len(x)), frame, surfaces)
+                joined = _joined(surfaces.shown[np.ix_(range(4), y, x)])
+                maps, codes = pipeline.framed(index, maps, codes, joined)
+                if plan.refine:
+                    self._refine(tiles, surfaces, frame, maps, codes, chosen)
+                codes[(codes == Status.OK) & edges[np.ix_(y, x)]] = Status.CONTESTED
+                result = pipeline.cut(index, maps, codes)
+            yield plan.unit(t_index, index), *result
+
+    def _surfaces(self, frame: int) -> Surfaces:
+        """What a frame shows, by the coarse search."""
+        plan, capture = self.plan, self.capture
+        search = plan.config.search
+        disparities = None if isinstance(search.disparity_range, str) else search.disparity_range
+        motions = None if isinstance(search.motion_range, str) else search.motion_range
+        extent = extent_of(plan, self.capture)
+
+        def image(t: int, sy: int, sx: int) -> NDArray[np.float32]:
+            return capture.read(t, sy, sx, 0, capture.height, 0, capture.width)
+
+        coarse = coarse_search(
+            self.pipeline.device, image, extent, reference=capture.reference, frame=frame,
+            moving="t" in plan.problem.columns.solutions, disparity_range=disparities, motion_range=motions,
+            mask=self.pipeline.mask,
+        )  # fmt: skip
+        return Surfaces(self.pipeline.device, coarse, extent, plan.cameras, capture.reference)
+
+    def _tiles(self, y: range, x: range, surfaces: Surfaces) -> list[_Tile]:
+        found = []
+        for first in range(0, len(x), self.plan.tile_cols):
+            cols = slice(first, min(first + self.plan.tile_cols, len(x)))
+            labels = np.unique(surfaces.number[np.ix_(y, x[cols])])
+            found.append(_Tile(slice(0, len(y)), cols, y, x[cols], tuple(int(n) for n in labels)))
+        return found
+
+    def _stay(self, tile: _Tile, surfaces: Surfaces, aim: Aim, frame: int) -> Stay:
+        """The engine at a tile, to see one label's surface alone."""
+        pipeline = self.pipeline
+        return pipeline.stays.move(
+            pipeline.engine(self._band), self._band, (tile.x[0], tile.y[0]), aim, frame,
+            partial(surfaces.layer, aim), partial(surfaces.hidden, aim, frame),
+        )  # fmt: skip
+
+    def _frames(self, stay: Stay, each: Callable[[int, NDArray[np.float32], Mask], None]) -> None:
+        """All frames of the window of a stay, in turn."""
+        latency = stay.engine.tensor.latency
+        frames = range(stay.frame - latency, stay.frame + latency + 1)
+        with contextlib.closing(self.pipeline.reader.blocks(frames, stay.box, stay.aim, stay.frame)) as blocks:
+            for t in frames:
+                each(t, *next(blocks))
+
+    def _pass(self, tile: _Tile, surfaces: Surfaces, label: int, frame: int) -> tuple[Maps, Codes]:
+        """Maps and status of a tile as one label sees them."""
+        stays, samples = self.pipeline.stays, []
+        stay = self._stay(tile, surfaces, surfaces.aims[label], frame)
+        tensors = None
+
+        def push(t: int, block: NDArray[np.float32], finite: Mask) -> None:
+            nonlocal tensors
+            sample, tensors = stays.push(stay, t, block, finite)
+            if t == frame:
+                samples.append(without_images(sample))
+
+        self._frames(stay, push)
+        self.pipeline.device.synchronize()
+        maps, status = stays.maps(stay, tensors, samples[0])
+        inner = (slice(0, len(tile.y)), slice(0, len(tile.x)))
+        return {name: values[inner] for name, values in maps.items()}, status[inner]
+
+    def _measured(
+        self, tiles: list[_Tile], shape: tuple[int, int], frame: int, surfaces: Surfaces
+    ) -> tuple[Maps, Codes, NDArray[np.int64]]:
+        """Maps and status of a band's tiles, and the label that each pixel took."""
+        maps: Maps = {}
+        codes, chosen = np.full(shape, Status.BORDER, np.uint8), np.full(shape, UNDECIDED)
+        for tile in tiles:
+            passes = [self._pass(tile, surfaces, label, frame) for label in tile.labels]
+            which = _best(passes, tile, surfaces)
+            for n, (found, status) in enumerate(passes):
+                mine = which == n
+                codes[tile.place][mine] = status[mine]
+                chosen[tile.place][mine] = tile.labels[n]
+                for name, values in found.items():
+                    maps.setdefault(name, empty_map(name, shape))[tile.place][mine] = values[mine]
+        return maps, codes, chosen
+
+    def _refine(
+        self, tiles: list[_Tile], surfaces: Surfaces, frame: int, maps: Maps, codes: Codes, chosen: NDArray[np.int64]
+    ) -> None:
+        """Refine a band's pixels, then those that no pass had values for, from tile to tile as far as they lead."""
+        for tile in tiles:
+            for label in tile.labels:
+                mine = chosen[tile.place] == label
+                if (mine & (codes[tile.place] == Status.OK)).any():
+                    self._refine_label(tile, surfaces, label, frame, maps, codes, mine, False)
+        missing = np.zeros(codes.shape, np.bool_)
+        for tile in tiles:
+            missing[tile.place] = surfaces.known[np.ix_(tile.y, tile.x)]
+        missing &= np.isin(codes, BEYOND)
+        before = -1
+        while before != (before := int(np.count_nonzero(missing))):
+            for tile in tiles:
+                number = surfaces.number[np.ix_(tile.y, tile.x)]
+                for label in tile.labels:
+                    wanted = (number == label) & missing[tile.place]
+                    joined = _joined(surfaces.shown[np.ix_(range(4), tile.y, tile.x)])
+                    known = (codes[tile.place] == Status.OK) & np.isfinite(maps["depth"][tile.place])
+                    if ring(wanted, known, joined)[0].size:
+                        self._refine_label(tile, surfaces, label, frame, maps, codes, wanted, True)
+                        missing[tile.place] &= ~(wanted & np.isin(codes[tile.place], HAS_VALUE))
+
+    def _refine_label(
+        self, tile: _Tile, surfaces: Surfaces, label: int, frame: int, maps: Maps, codes: Codes, mine: Mask,
+        beyond: bool,
+    ) -> None:  # fmt: skip
+        """Refine the pixels ``mine`` of a tile with the images that one label aims at, in place. ``beyond``: pixels
+        without values, from their neighbours."""
+        plan = self.plan
+        stay = self._stay(tile, surfaces, surfaces.aims[label], frame)
+        self._frames(stay, partial(self.pipeline.stays.refine_alone, stay))
+        assert stay.engine.refine is not None
+        assert plan.refine is not None
+        part = {name: values[tile.place].copy() for name, values in maps.items()}
+        place = Place(tile.y, tile.x, (stay.wide.y, stay.wide.x), plan.geometry)
+        status = codes[tile.place].copy()
+        if beyond:
+            joined = _joined(surfaces.shown[np.ix_(range(4), tile.y, tile.x)])
+            effort = refine_beyond(stay.engine.refine, plan.refine, part, status, place, mine, joined)
+        else:
+            status[~mine] = Status.NOT_COMPUTED
+            effort = refine_maps(stay.engine.refine, plan.refine, part, status, place)
+        self.pipeline.effort += effort
+        codes[tile.place][mine] = status[mine]
+        for name, values in part.items():
+            maps[name][tile.place][mine] = values[mine]
+
+
+def extent_of(plan: Plan, capture: Capture) -> Extent:
+    """How the search sees a capture; along axes that the model does not read there is one camera."""
+    read = [len(cameras) > 1 for cameras in plan.cameras]
+    rows, cols = (n if several else 1 for n, several in zip((capture.n_rows, capture.n_cols), read, strict=True))
+    geometry = plan.geometry
+    return Extent(
+        capture.n_frames, rows, cols, capture.height, capture.width, geometry.baseline_mm, geometry.disparity_offset_px
+    )
+
+
+def _best(passes: list[tuple[Maps, Codes]], tile: _Tile, surfaces: Surfaces) -> NDArray[np.int64]:
+    """Which pass each pixel takes: that of its own label, or where that has no value, of those that may be meant the
+    one with the highest confidence."""
+    at = np.ix_(tile.y, tile.x)
+    number, shown = surfaces.number[at], surfaces.shown[np.ix_(range(4), tile.y, tile.x)]
+    which = np.zeros(number.shape, np.int64)
+    for n, label in enumerate(tile.labels):
+        which[number == label] = n
+    valued = np.stack([np.isin(status, HAS_VALUE) for _, status in passes])
+    missing = ~np.take_along_axis(valued, which[None], axis=0)[0]
+    if len(passes) == 1 or not missing.any():
+        return which
+    best = np.full(number.shape, -1.0)
+    around = -(-EDGE // tile.x.step)
+    for n, label in enumerate(tile.labels):
+        aim = surfaces.aims[label]
+        away = np.abs(shown - np.array([*aim.shift, *aim.motion])[:, None, None]).max(axis=0)
+        meant = (away <= REACH) | dilated(number == label, around)
+        confidence = np.where(valued[n] & meant, np.nan_to_num(passes[n][0]["confidence"]), -1.0)
+        better = missing & (confidence > best)
+        which[better], best[better] = n, confidence[better]
+    return which
+
+
+def _joined(shown: NDArray[np.float32]) -> tuple[Mask, Mask]:
+    """Whether pixels [4, rows, cols] show one surface with their neighbours: [rows - 1, cols], [rows, cols - 1]."""
+    down, across = (np.abs(np.diff(shown, axis=axis)).max(axis=0) <= REACH for axis in (1, 2))
+    return down, across
