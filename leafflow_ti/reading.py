@@ -72,7 +72,7 @@ class Reader:
         finite = np.ones(block.shape, bool)
         fills = self.capture.fills(block[None], [t], sy, sx, box.y + y, box.x + x, aim.shift)
         images = (array.reshape(-1, box.rows, box.cols) for array in (block, finite))
-        whole = self.capture.dtype.kind in "bui"  # integers are finite
+        whole = self.capture.finite
         pieces: list[Callable[[], None]] = [
             partial(_fill, whole, fill, *image) for fill, *image in zip(fills, *images, strict=True)
         ]

@@ -61,13 +61,13 @@ def spline(u: NDArray[Any], degree: int) -> Array:
 
 
 @functools.cache
-def filter_taps(degree: int) -> Array:
+def filter_taps(degree: int, sigma: float = PREFILTER_SIGMA) -> Array:
     """Symmetric kernel from grey values to spline coefficients of the smoothed image, float64 [2 radius + 1].
 
-    A Gaussian of ``PREFILTER_SIGMA`` and the inverse of the sampled spline, along one axis; the sum is 1.
+    A Gaussian of ``sigma`` px (0: none) and the inverse of the sampled spline, along one axis; the sum is 1.
     """
     offset = np.fft.fftfreq(_PERIOD, 1 / _PERIOD)
-    gaussian = np.exp(-0.5 * (offset / PREFILTER_SIGMA) ** 2)
+    gaussian = np.exp(-0.5 * (offset / sigma) ** 2) if sigma else (offset == 0).astype(float)
     taps = np.fft.fftshift(np.fft.ifft(np.fft.fft(gaussian) / np.fft.fft(spline(offset, degree)).real).real)
     radius = int(np.abs(np.flatnonzero(np.abs(taps) >= LEAST_TAP * taps.max()) - _PERIOD // 2).max())
     taps = taps[_PERIOD // 2 - radius : _PERIOD // 2 + radius + 1]
@@ -76,6 +76,6 @@ def filter_taps(degree: int) -> Array:
     return taps
 
 
-def filter_radius(degree: int) -> int:
+def filter_radius(degree: int, sigma: float = PREFILTER_SIGMA) -> int:
     """Pixels that a coefficient needs on each side."""
-    return len(filter_taps(degree)) // 2
+    return len(filter_taps(degree, sigma)) // 2

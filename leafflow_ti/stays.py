@@ -191,7 +191,7 @@ class Stays:
             if name in sample.maps:
                 maps[name] = sample.maps[name][stay.centre].astype(np.float32)
             else:
-                maps[name] = planes[_plane_of(base) + (Output.STD if name != base else 0)].astype(np.float32)
+                maps[name] = planes[plane_of(base) + (Output.STD if name != base else 0)].astype(np.float32)
         found = settle(maps, status, self.plan.limits)
         # Texture in all directions, and nothing determined: the window is too small, or degenerate.
         status[(status == Status.OK) & (found == 0)] = Status.NOT_CONVERGED
@@ -203,7 +203,7 @@ def without_images(sample: Sample) -> Sample:
     return replace(sample, block=np.empty((0, 0, 0, 0), np.float32))
 
 
-def _plane_of(name: str) -> int:
+def plane_of(name: str) -> int:
     from leafflow_ti.kernels.maps import Output
 
     if name in MOTION_NAMES:

@@ -3,7 +3,7 @@
 Axes are ``t, sy, sx, y, x``: frame, camera row, camera column, pixel row (down), pixel column (right). Frames and
 cameras are addressed by index from 0; the reference camera is ``(n_rows // 2, n_cols // 2)``, and ``k`` counts cameras
 from it. Lengths are in mm, image positions in pixel with (0, 0) the centre of the first pixel. Grey values are those of
-the files.
+the files, or, with a calibration, those of the rectified images made of them, NaN where these show nothing.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from leafflow_ti.capture.channels import Array, Channel
 from leafflow_ti.capture.description import FILE_NAME, Description, read_description
 from leafflow_ti.capture.images import read_window
 from leafflow_ti.capture.layout import Layout, find_layout
+from leafflow_ti.capture.lens import Lens
 from leafflow_ti.capture.measured import (
     LEAST_FRACTION,
     REACH,
@@ -35,6 +36,7 @@ from leafflow_ti.capture.measured import (
     stated_stamps,
     time_stamps,
 )
+from leafflow_ti.capture.rectification import Rectification, find_rectification
 from leafflow_ti.errors import ConfigError, InputError
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
@@ -88,6 +90,13 @@ class Capture(ABC):
     """Measured camera positions [rows, columns, (x, y)] relative to the reference camera; None: as ``baseline_mm``."""
     stamps_s: tuple[float, ...] | None = field(repr=False)
     """Measured time of each frame; None: one ``frame_interval_s`` after the other."""
+    lenses: tuple[tuple[Lens, ...], ...] | None = field(default=None, repr=False, kw_only=True)
+    """For each camera row and column the lens whose distortion is taken out; None: images are taken as they are."""
+
+    @property
+    def finite(self) -> bool:
+        """Whether every grey value inside the images is known to be a number."""
+        return self.dtype.kind in "bui" and self.lenses is None
 
     @property
     def reference(self) -> tuple[int, int]:
@@ -169,7 +178,7 @@ class Capture(ABC):
     def read(
         self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int, dtype: npt.DTypeLike = np.float32
     ) -> Array:
-        """Window ``[y1-y0, x1-x0]`` of one image; what lies outside the image is 0.
+        """Window ``[y1-y0, x1-x0]`` of one image, as a floating type; what lies outside the image is 0.
 
         Raises InputError if the file cannot be decoded, IndexError for a frame or camera that does not exist.
         """
@@ -240,8 +249,13 @@ class Capture(ABC):
                 raise IndexError(f"{name} {index} does not exist: the capture has 0 to {count - 1}")
         y0, y1 = max(top, 0), min(top + out.shape[0], self.height)
         x0, x1 = max(left, 0), min(left + out.shape[1], self.width)
-        if y0 < y1 and x0 < x1:
-            out[y0 - top : y1 - top, x0 - left : x1 - left] = self._window(t, sy, sx, y0, y1, x0, x1)
+        if y0 >= y1 or x0 >= x1:
+            return
+        inside = out[y0 - top : y1 - top, x0 - left : x1 - left]
+        if self.lenses is None:
+            inside[...] = self._window(t, sy, sx, y0, y1, x0, x1)
+        else:
+            self.lenses[sy][sx].rectify(inside, y0, x0, (self.height, self.width), partial(self._window, t, sy, sx))
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +309,9 @@ class FileCapture(Capture):
             name = path.relative_to(root) if path.is_relative_to(root) else path
             listing.update(f"{name.as_posix()}\0{path.stat().st_size}\n".encode())
         ends = {"first_file_sha256": self.layout.paths[0], "last_file_sha256": self.layout.paths[-1]}
+        calibrations = dict.fromkeys(lens.calibration.path for row in self.lenses or () for lens in row)
         return {
+            **({"calibration_sha256": [_sha256(path) for path in calibrations]} if calibrations else {}),
             "files": len(self.layout.paths),
             "names_and_sizes_sha256": listing.hexdigest(),
             **({name: _sha256(path) for name, path in ends.items()} if contents else {}),
@@ -335,7 +351,8 @@ def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Fi
     info = layout.info
     n_frames, n_rows, n_cols = layout.file.shape
     bits = description.images.bit_depth or info.bits
-    geometry = _geometry(path, description, n_rows, n_cols, info.height, info.width)
+    rectified = find_rectification(path, description.camera, layout)
+    geometry = _geometry(path, description, rectified, n_rows, n_cols, info.height, info.width)
     stamps, interval = stated_stamps(path, description, layout)
     return FileCapture(
         n_frames=n_frames,
@@ -354,6 +371,7 @@ def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Fi
         stamps_s=stamps,
         layout=layout,
         channel=description.images.channel,
+        lenses=rectified.lenses if rectified else None,
         _cache=ImageCache(cache_bytes),
     )
 
@@ -409,8 +427,9 @@ def capture_from_array(
 
 
 def _geometry(
-    path: Path, description: Description, n_rows: int, n_cols: int, height: int, width: int
-) -> Geometry | None:
+    path: Path, description: Description, rectified: Rectification | None,
+    n_rows: int, n_cols: int, height: int, width: int,
+) -> Geometry | None:  # fmt: skip
     """Geometry of a description for a grid of this size; raises ConfigError for what is missing or does not fit."""
     camera, grid = description.camera, description.grid
     if n_rows * n_cols > 1 and (camera is None or grid is None):
@@ -423,9 +442,13 @@ def _geometry(
     for axis, count, step in (("x", n_cols, baseline[0]), ("y", n_rows, baseline[1])):
         if count > 1 and step == 0:
             raise ConfigError(f"{path}: [grid] baseline_mm along {axis} is 0 for {count} cameras: give the camera step")
+    f_px, principal = camera.f_px, camera.principal_point_px or ((width - 1) / 2, (height - 1) / 2)
+    if rectified:
+        f_px, principal = rectified.f_px, rectified.principal_px
+    assert f_px is not None  # a description has one or the other
     return Geometry(
-        f_px=camera.f_px,
-        principal_px=camera.principal_point_px or ((width - 1) / 2, (height - 1) / 2),
+        f_px=f_px,
+        principal_px=principal,
         baseline_mm=(baseline[0] if n_cols > 1 else 0.0, baseline[1] if n_rows > 1 else 0.0),
         disparity_offset_px=(offset[0] if n_cols > 1 else 0.0, offset[1] if n_rows > 1 else 0.0),
     )

@@ -13,6 +13,8 @@
     [camera]
     focal_length_px = 2800.0          # or focal_length_mm and pixel_pitch_mm
     principal_point_px = [319.5, 239.5]          # default: image centre (W-1)/2, (H-1)/2
+    # or calibration = "camera.yml"   OpenCV's file; "cam_{sx}.yml" (fields sx, sy): one for each camera. Images are
+    #                                 undistorted and rectified while they are read, see ``calibration``
     [grid]
     baseline_mm = [5.0, 5.0]          # x, y step of the camera for each step of sx, sy; one number for a 1D grid
     disparity_offset_px = [0.0, 0.0]  # total disparity = disparity seen in the images + this, per step
@@ -139,22 +141,36 @@ class Camera(_Section):
     focal_length_mm: _Positive | None = None
     pixel_pitch_mm: _Positive | None = None
     principal_point_px: tuple[_Finite, _Finite] | None = None
+    calibration: StrictStr | None = None
+
+    @property
+    def calibration_pattern(self) -> Pattern | None:
+        """The calibration file's name, with a field for each axis of cameras that it is given for."""
+        return None if self.calibration is None else Pattern.parse(self.calibration)
+
+    @field_validator("calibration")
+    @classmethod
+    def _one_file_per_camera(cls, value: str | None) -> str | None:
+        other = set(Pattern.parse(value).fields) - {"sx", "sy"} if value is not None else set()
+        if other:
+            raise ValueError(f"field '{{{min(other)}}}': one file for all cameras, or the fields sx and sy")
+        return value
 
     @model_validator(mode="after")
     def _one_focal_length(self) -> Self:
         metric = (self.focal_length_mm is not None, self.pixel_pitch_mm is not None)
-        if (self.focal_length_px is not None) == any(metric) or metric[0] != metric[1]:
-            raise ValueError("give either focal_length_px, or focal_length_mm and pixel_pitch_mm")
+        twice = self.focal_length_px is not None and any(metric)
+        missing = self.focal_length_px is None and not any(metric) and self.calibration is None
+        if twice or missing or metric[0] != metric[1]:
+            raise ValueError("give focal_length_px, or focal_length_mm and pixel_pitch_mm, or a calibration")
         return self
 
     @property
-    def f_px(self) -> float:
-        """Focal length in pixel."""
-        if self.focal_length_px is not None:
-            return self.focal_length_px
-        assert self.focal_length_mm is not None
-        assert self.pixel_pitch_mm is not None
-        return self.focal_length_mm / self.pixel_pitch_mm
+    def f_px(self) -> float | None:
+        """Focal length in pixel; None where the calibration states it."""
+        if self.focal_length_mm is not None and self.pixel_pitch_mm is not None:
+            return self.focal_length_mm / self.pixel_pitch_mm
+        return self.focal_length_px
 
 
 class Grid(_Section):

@@ -21,6 +21,7 @@ from leafflow_ti.errors import InputError
 _MAX_CROP = 1024  # pixels of the middle of the image that are compared
 _MIN_SIZE = 16
 _BAND_PX = (1.0, 10.0)  # standard deviations of the Gaussians whose difference is the band pass
+_LEAST_KNOWN = 1e-3  # share of a neighbourhood of which a mean is formed
 _CROSS_PX = 2  # misalignment across the grid axis that is tolerated
 _CLEAR = 0.3  # correlation of a clear peak; independent noise stays below 0.15
 _REPEAT = 0.7  # an image that resembles itself elsewhere this well, relative to its neighbour, repeats itself
@@ -153,16 +154,31 @@ def _band_pass(image: _Image) -> _Image:
         raise InputError(
             f"images of {min(image.shape)} px are too small to find a disparity, {_MIN_SIZE} px: {_WAY_OUT}"
         )
-    if not np.isfinite(image).all():
-        raise InputError(f"images hold grey values that are not finite, no disparity can be found: {_WAY_OUT}")
+    known = np.isfinite(image)
+    if not known.any():
+        raise InputError(f"images hold no grey values that are finite, no disparity can be found: {_WAY_OUT}")
+    grey = np.where(known, image - image[known].mean(), 0.0)
     margin = int(2 * _BAND_PX[1])
-    padded = np.pad(image - image.mean(), margin, mode="symmetric")
-    fy = np.fft.fftfreq(padded.shape[0])[:, None]
-    fx = np.fft.rfftfreq(padded.shape[1])[None, :]
-    narrow, wide = (np.exp(-2 * np.pi**2 * sigma**2 * (fy**2 + fx**2)) for sigma in _BAND_PX)
-    passed = np.fft.irfft2(np.fft.rfft2(padded) * (narrow - wide), padded.shape)
-    result = passed[margin:-margin, margin:-margin]
-    if result.std() <= 1e-9 * max(1.0, float(np.abs(image).max())):
+    shape = (image.shape[0] + 2 * margin, image.shape[1] + 2 * margin)
+    fy = np.fft.fftfreq(shape[0])[:, None]
+    fx = np.fft.rfftfreq(shape[1])[None, :]
+
+    responses = [np.exp(-2 * (np.pi * sigma) ** 2 * (fy**2 + fx**2)) for sigma in _BAND_PX]
+
+    def filtered(values: _Image, response: _Image) -> _Image:
+        spectrum = np.fft.rfft2(np.pad(values, margin, mode="symmetric"))
+        return np.asarray(np.fft.irfft2(spectrum * response, shape)[margin:-margin, margin:-margin])
+
+    if known.all():
+        result = filtered(grey, responses[0] - responses[1])
+    else:
+        # Means over what is known of a neighbourhood; far from it there is nothing to divide.
+        narrow, wide = (
+            filtered(grey, response) / np.maximum(filtered(known.astype(float), response), _LEAST_KNOWN)
+            for response in responses
+        )
+        result = np.where(known, narrow - wide, 0.0)
+    if result.std() <= 1e-9 * max(1.0, float(np.abs(image[known]).max())):
         return np.zeros_like(image)
     return result
 

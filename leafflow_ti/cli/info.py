@@ -70,6 +70,9 @@ def capture_facts(capture: FileCapture) -> dict[str, Any]:
             "principal_point_px": list(g.principal_px),
             "baseline_mm": list(g.baseline_mm),
             "disparity_offset_px": list(g.disparity_offset_px),
+            "calibration": capture.description.camera.calibration
+            if capture.description and capture.description.camera
+            else None,
         }
         if capture.positions_mm is not None:
             facts["geometry"]["largest_deviation_mm"] = _largest_deviation(capture)
@@ -143,6 +146,10 @@ def _capture_lines(facts: dict[str, Any]) -> list[str]:
         lines.append(
             f"positions    measured; farthest from its nominal place: camera row {most['row']}, column "
             f"{most['column']}, by {_pair(most['xy'])} mm (x, y)"
+        )
+    if geometry["calibration"]:
+        lines.append(
+            f"calibration  {geometry['calibration']}: images are undistorted and rectified while they are read"
         )
     if any(geometry["disparity_offset_px"]):
         lines.append(

@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),
     "profile": ("profile:profile", "Measure the stages of a run on this machine, and predict the whole."),
+    "plan-rig": ("plan_rig:plan_rig", "Predict the standard errors of a camera rig, and what would improve it most."),
     "info": ("info:info", "Say what a capture, or a results store, is."),
 }
 """Command -> where it lives (module of this package:object) and its line in the help."""
