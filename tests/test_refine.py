@@ -87,8 +87,8 @@ def test_a_plane_that_faces_the_camera_is_found_in_pixels(device: Start, precisi
 
 def test_two_images_are_enough(device: Start, precision: str) -> None:
     """Of one camera, as in digital image correlation. The twin's solution is one of the kernels; from further away they
-    end a tenth of a standard error before it, which is more here than among many images. Error bars are 4 % longer: robust weights count
-    as images that are missing, and of two each is half."""
+    end a tenth of a standard error before it, which is more here than among many images. So few residuals tell their
+    variance to 5 %: that much robust weights make of it."""
     case = PAIR
     wanted = case.twin()
     errors = np.sqrt(np.diag(wanted.covariance))
@@ -96,7 +96,7 @@ def test_two_images_are_enough(device: Start, precision: str) -> None:
         found = case.refine(device(precision), start)
         assert found.converged.all()
         assert np.abs(estimated(found.parameters[0] - wanted.state, case) / errors).max() < left
-        np.testing.assert_allclose(np.sqrt(np.diag(covariance(found, case))) / errors, 1.04, atol=0.02)
+        np.testing.assert_allclose(np.sqrt(np.diag(covariance(found, case))) / errors, 1.0, atol=0.05)
 
 
 def test_splines_of_either_degree_find_the_same(device: Start) -> None:
