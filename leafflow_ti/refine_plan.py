@@ -115,7 +115,7 @@ class Refinement:
         modes = {0: "no deformation", 1: "growth", 3: "strain"}[self.modes]
         rigid = f"depth, slopes, {self.motion} of motion"
         if self.flat:
-            rigid = "flow, rotation, acceleration" if self.turns else "flow"
+            rigid = ", ".join(("flow", "rotation", "acceleration")[: self.motion // 3])
         return (
             f"refinement  at most {self.steps} steps, window of {self.size} px thinned by {self.thin} "
             f"({self.across**2} samples), {len(self.frames)} frames of {len(self.cameras)} cameras; {self.unknowns} "

@@ -20,6 +20,8 @@ from leafflow_ti.kernels.refine_tables import (
 from leafflow_ti.kernels.refine_warp import warp_functions
 from leafflow_ti.kernels.spec import KernelSpec
 
+LEAST_IMAGES = 1.5
+"""Images that must be left for a comparison, robust weights taken off: of two, some of the samples."""
 LONGEST_STEP = 1.0
 """Pixels that a step may move anything in the window of any image."""
 RISE = 1.02
@@ -280,7 +282,7 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
         cost = p[s + Scalar.COST]
         if passes == 1:
             p[s + Scalar.START] = cost
-        if p[s + Scalar.IMAGES] < 2.0:
+        if p[s + Scalar.IMAGES] < LEAST_IMAGES:
             p[s + Scalar.DONE], p[s + Scalar.CODE] = precise(1.0), empty
         elif passes > 1 and not (cost <= p[s + Scalar.BEST] * RISE):
             shorten(slot, size, P, p)
