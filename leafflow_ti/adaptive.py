@@ -32,6 +32,9 @@ from leafflow_ti.trace import span
 Codes = NDArray[np.uint8]
 BEYOND = (Status.BORDER, Status.INCOHERENT, Status.NOT_CONVERGED)
 """Statuses of pixels that the refinement may still have values for: not all images see all of their windows."""
+STRAY = 1.0
+"""Pixels per step or frame between a measured value and the search's, beyond which it is of another surface, or none:
+the search is good to half a pixel where it is right, and on real images (Tsukuba) it is then right nine times of ten."""
 UNDECIDED = -1
 """Instead of the number of a label: no pass gave a value."""
 
@@ -93,7 +96,9 @@ class Adaptive:
                 maps, codes = pipeline.framed(index, maps, codes, joined)
                 if plan.refine:
                     self._refine(tiles, surfaces, frame, maps, codes, chosen)
+                    self._drop_strays(maps, codes, surfaces, y, x)
                 codes[(codes == Status.OK) & edges[np.ix_(y, x)]] = Status.CONTESTED
+                self._fill_in(maps, codes, surfaces, y, x)
                 result = pipeline.cut(index, maps, codes)
             yield plan.unit(t_index, index), *result
 
@@ -114,6 +119,51 @@ class Adaptive:
             mask=self.pipeline.mask,
         )  # fmt: skip
         return Surfaces(self.pipeline.device, coarse, extent, plan.cameras, capture.reference)
+
+    def _strays(self, maps: Maps, surfaces: Surfaces, y: range, x: range) -> Mask:
+        """Pixels whose values lie farther from what the search found than a pass can see: they follow something else,
+        or nothing."""
+        there = np.ix_(y, x)
+        strays = np.zeros((len(y), len(x)), np.bool_)
+        for name, values in self._shown(surfaces, there).items():
+            if name in maps:
+                with np.errstate(invalid="ignore"):
+                    strays |= np.abs(maps[name] - values) > STRAY
+        return strays
+
+    def _drop_strays(self, maps: Maps, codes: Codes, surfaces: Surfaces, y: range, x: range) -> None:
+        """Take their values from pixels that strayed."""
+        strays = self._strays(maps, surfaces, y, x) & np.isin(codes, HAS_VALUE)
+        codes[strays] = Status.INCOHERENT
+        for name, values in maps.items():
+            values[strays] = empty_map(name, ())
+
+    def _fill_in(self, maps: Maps, codes: Codes, surfaces: Surfaces, y: range, x: range) -> None:
+        """What the search found, where nothing better is known."""
+        there = np.ix_(y, x)
+        empty = np.isin(codes, BEYOND) & surfaces.known[there]
+        if self.pipeline.mask is not None:
+            empty &= self.pipeline.mask[there]
+        found = self._shown(surfaces, there)
+        if "disparity" in found:
+            geometry, axis = self.plan.geometry, surfaces.axis
+            with np.errstate(divide="ignore"):
+                depth = -geometry.f_px * geometry.baseline_mm[axis] / found["disparity"]
+            found["depth"] = depth
+            empty &= np.isfinite(depth) & (depth > 0)
+        for name, values in found.items():
+            if name in maps:
+                maps[name][empty] = values[empty]
+        codes[empty] = Status.COARSE
+
+    def _shown(self, surfaces: Surfaces, there: tuple[NDArray[np.intp], ...]) -> dict[str, NDArray[np.float32]]:
+        """The maps that the search itself gives, at some pixels."""
+        found, offset = {}, self.plan.geometry.disparity_offset_px
+        if self.plan.problem.camera_axes:
+            found["disparity"] = surfaces.shown[surfaces.axis][there] + np.float32(offset[surfaces.axis])
+        if "t" in self.plan.problem.columns.solutions:
+            found |= {"flow_x": surfaces.shown[2][there], "flow_y": surfaces.shown[3][there]}
+        return found
 
     def _tiles(self, y: range, x: range, surfaces: Surfaces) -> list[_Tile]:
         found = []
@@ -161,7 +211,9 @@ class Adaptive:
         self.pipeline.device.synchronize()
         maps, status = stays.maps(stay, tensors, samples[0])
         inner = (slice(0, len(tile.y)), slice(0, len(tile.x)))
-        return {name: values[inner] for name, values in maps.items()}, status[inner]
+        maps, status = {name: values[inner] for name, values in maps.items()}, status[inner]
+        status[self._strays(maps, surfaces, tile.y, tile.x) & np.isin(status, HAS_VALUE)] = Status.INCOHERENT
+        return maps, status
 
     def _measured(
         self, tiles: list[_Tile], shape: tuple[int, int], frame: int, surfaces: Surfaces

@@ -38,6 +38,7 @@ STATUS_COLOURS: dict[Status, str] = {
     Status.NOT_FINITE: "#e88fb0",
     Status.UNREFINED: "#5b9bd0",
     Status.CONTESTED: "#c9a86a",
+    Status.COARSE: "#9fc3a8",
     Status.NOT_COMPUTED: "#f7f7f7",
 }
 """Colour of each status in the pictures."""

@@ -21,6 +21,7 @@ class Status(IntEnum):
     NOT_FINITE = 7
     UNREFINED = 8
     CONTESTED = 9
+    COARSE = 10
     NOT_COMPUTED = 255
 
 
@@ -36,9 +37,11 @@ ADVICE: dict[Status, str] = {
     Status.UNREFINED: "the exact refinement did not converge, fitted no better, or would mix surfaces that a robust "
     "estimate told apart: the values are those before it",
     Status.CONTESTED: "two surfaces meet here: the values are those of the one that explains the images better",
+    Status.COARSE: "no window measures this pixel: disparity, depth and flow are those of the coarse search, good to a "
+    "fraction of a pixel, without standard errors",
     Status.NOT_COMPUTED: "not computed yet, or outside the region of interest",
 }
 """One sentence of advice for each status."""
 
-HAS_VALUE = (Status.OK, Status.APERTURE, Status.UNREFINED, Status.CONTESTED)
+HAS_VALUE = (Status.OK, Status.APERTURE, Status.UNREFINED, Status.CONTESTED, Status.COARSE)
 """Codes whose maps hold numbers."""

@@ -52,7 +52,8 @@ class Surfaces:
         self._many = extent.n_cols * extent.n_rows > 1
         toward = -float(np.sign(extent.baseline[axis])) or 1.0
         self._nearness = np.where(coarse.known, self.shown[axis] * np.float32(toward), np.float32(-1e9))
-        self._toward, self._axis = toward, axis
+        self.axis, self._toward = axis, toward
+        """The main axis of the grid, 0 for x."""
         self._steps = [[n - r for n in some] for some, r in zip(cameras, reference, strict=True)]
 
     def near_edges(self, reach: int = EDGE) -> Mask:
@@ -88,7 +89,7 @@ class Surfaces:
         """
         from leafflow_ti.kernels.hiding import hiding_kernel
 
-        least = REACH if not self._many else REACH + self._toward * aim.shift[self._axis]
+        least = REACH if not self._many else REACH + self._toward * aim.shift[self.axis]
         nearness = self._nearness if self._many else self._otherwise(aim)
         views = np.array([(kx, ky, elapsed) for ky in self._steps[0] for kx in self._steps[1]], float).T
         regions = self._regions(aim, views, box, nearness > least)
