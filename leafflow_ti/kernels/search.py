@@ -137,8 +137,7 @@ def _formulas(spec: KernelSpec):
     def winner(
         pixel: ti.i32, rows: ti.i32, cols: ti.i32, tile: ti.i32, tiles_x: ti.i32, slots: ti.i32, ordered: ti.i32,
         count: ti.template(), label: ti.template(), near: ti.template(), cost: ti.template(), total: ti.template(),
-        chosen: ti.template(),
-        found: ti.template(), price: ti.template(),
+        chosen: ti.template(), found: ti.template(), price: ti.template(),
     ):  # fmt: skip
         """The label of least total cost; per axis the vertex of the parabola through it and the labels beside it."""
         y = pixel // cols
