@@ -35,7 +35,8 @@ WIDEST = 0.25
 MOST_MOTION = 24.0
 """Pixels per frame that are searched for unless a range is given."""
 VOLUME = 24e6
-"""Costs that are held at most, per array; larger images are searched at reduced resolution."""
+"""Costs per array at most; larger images are searched at reduced resolution. There is an array for each side of the
+reference on which cameras stand, and two more: .6 GB."""
 MOST_LABELS = 80
 """Disparities at most between the limits."""
 ROUGH_SIZE, ROUGH_LABELS = 300, 128

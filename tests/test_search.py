@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tifffile
+from PIL import Image
 from reference.search import aggregated, costs
 
 from leafflow_ti.errors import UsageError
@@ -15,6 +17,8 @@ from leafflow_ti.search import Extent, coarse_search, enlarged, noise_floor, red
 from leafflow_ti.stages.candidates import proposals, tiled, votes
 from leafflow_ti.stages.search import Costs, Labels, Views, box_mean, features, search
 from leafflow_ti.synthetic.leaves import LeavesScene, render_image, truth
+from perf import yosemite
+from perf.inputs import absent, data_folder
 
 ROWS, COLS, TILE = 13, 17, 6
 RATING = Costs(most=0.9, small=0.11, large=0.7, support=2, alike=0.8, edge=0.6)
@@ -242,3 +246,35 @@ def test_nothing_is_known_without_texture_and_outside_the_mask(device: Callable[
 def test_ranges_are_checked(device: Callable[[str], Device], options: dict, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         searched(device("f32"), SCENE, **options)
+
+
+def needs(name: str) -> pytest.MarkDecorator:
+    reason = absent(name)
+    return pytest.mark.skipif(reason is not None, reason=reason or "")
+
+
+@needs("tsukuba_row")
+def test_disparities_of_the_head_and_lamp(device: Callable[[str], Device]) -> None:
+    """Real images; the limits, 5 to 14 px per step, are found."""
+    folder = data_folder("tsukuba_row")
+    images = [np.asarray(Image.open(folder / f"scene1.row3.col{k}.ppm").convert("L"), np.float32) for k in range(1, 6)]
+    counted = np.asarray(Image.open(folder / "truedisp.row3.col3.pgm"), np.float32)
+    found = coarse_search(
+        device("f32"), lambda t, sy, sx: images[sx], Extent(1, 1, 5, *counted.shape), reference=(0, 2), frame=0
+    )
+    error = np.abs(found.disparity + counted / 16.0)[counted > 0]
+    # The truth is given in whole pixels: half a pixel is its own rounding.
+    assert (error <= 0.5).mean() > 0.9
+    assert (error <= 1.0).mean() > 0.95
+
+
+@needs(yosemite.NAME)
+def test_motions_of_yosemite(device: Callable[[str], Device]) -> None:
+    folder, true = data_folder(yosemite.NAME), yosemite.Truth.read()
+    images = [tifffile.imread(folder / f"yos{k}.tif").astype(np.float32) for k in (8, 9, 10)]
+    found = coarse_search(
+        device("f32"), lambda t, sy, sx: images[t], Extent(3, 1, 1, *true.sky.shape), reference=(0, 0), frame=1
+    )
+    error = np.abs(np.moveaxis(found.motion, 0, -1) - true.flow).max(axis=-1)[~true.sky]
+    assert (error < 1.0).mean() > 0.97
+    assert np.median(error) < 0.15

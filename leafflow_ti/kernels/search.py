@@ -15,9 +15,7 @@ from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
 NEAR = 9
-"""Labels at most that count as neighbours of a label, itself the first."""
-SIDES = 4
-"""Labels beside a label: before and behind it along x, along y."""
+"""A label itself, the labels one step before and behind it along x, then along y, and those across."""
 
 
 @functools.cache
@@ -125,9 +123,8 @@ def _formulas(spec: KernelSpec):
                             best = ti.min(best, behind[before + own])
                         for n in range(1, NEAR):
                             other = near[table + n]
-                            if other < 0:
-                                break
-                            best = ti.min(best, behind[before + other] + p1)
+                            if other >= 0:
+                                best = ti.min(best, behind[before + other] + p1)
                     value = cost[pixel * slots + k] + best - least
                     behind[now + k] = value
                     total[pixel * slots + k] = total[pixel * slots + k] + value  # += would be atomic
@@ -138,9 +135,9 @@ def _formulas(spec: KernelSpec):
 
     @ti.func
     def winner(
-        pixel: ti.i32, rows: ti.i32, cols: ti.i32, tile: ti.i32, tiles_x: ti.i32, slots: ti.i32, count: ti.template(),
-        label: ti.template(), beside: ti.template(), cost: ti.template(), total: ti.template(), chosen: ti.template(),
-        found: ti.template(), price: ti.template(),
+        pixel: ti.i32, rows: ti.i32, cols: ti.i32, tile: ti.i32, tiles_x: ti.i32, slots: ti.i32, ordered: ti.i32,
+        count: ti.template(), label: ti.template(), near: ti.template(), cost: ti.template(), total: ti.template(),
+        chosen: ti.template(), found: ti.template(), price: ti.template(),
     ):  # fmt: skip
         """The label of least total cost; per axis the vertex of the parabola through it and the labels beside it."""
         y = pixel // cols
@@ -155,7 +152,10 @@ def _formulas(spec: KernelSpec):
         middle = total[pixel * slots + best]
         for axis in range(2):
             value = label[(at + best) * 2 + axis]
-            one, two = beside[(at + best) * SIDES + 2 * axis], beside[(at + best) * SIDES + 2 * axis + 1]
+            one, two = best - 1, ti.select(best + 1 < count[here], best + 1, -1)
+            if ordered == 0:
+                table = ((here * NEAR + 4) * slots + best) * NEAR + 1 + 2 * axis
+                one, two = near[table], near[table + 1]
             if one >= 0 and two >= 0:
                 low, high = total[pixel * slots + one], total[pixel * slots + two]
                 bend = low - ti.cast(2.0, real) * middle + high
@@ -269,10 +269,11 @@ def winners_kernel(spec: KernelSpec):
         tile: ti.i32,
         tiles_x: ti.i32,
         slots: ti.i32,
+        ordered: ti.i32,
         n_tasks: ti.i32,
         count_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tiles]
         label_in: ti.types.ndarray(dtype=real, ndim=1),  # [tiles, slots, 2]
-        beside_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tiles, slots, SIDES]
+        near_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [tiles, NEAR, slots, NEAR]
         cost_in: ti.types.ndarray(dtype=real, ndim=1),  # [rows, cols, slots]
         total_in: ti.types.ndarray(dtype=real, ndim=1),  # [rows, cols, slots]
         chosen_out: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [rows, cols]
@@ -283,16 +284,16 @@ def winners_kernel(spec: KernelSpec):
         if ti.static(spec.gpu):
             for p in range(size):
                 winner(
-                    p, rows, cols, tile, tiles_x, slots, count_in, label_in, beside_in, cost_in, total_in, chosen_out,
-                    found_out, price_out,
+                    p, rows, cols, tile, tiles_x, slots, ordered, count_in, label_in, near_in, cost_in, total_in,
+                    chosen_out, found_out, price_out,
                 )  # fmt: skip
         else:
             for task, part in ti.ndrange(n_tasks, TASK_GRAIN):
                 if part == 0:
                     for p in range(task * size // n_tasks, (task + 1) * size // n_tasks):
                         winner(
-                            p, rows, cols, tile, tiles_x, slots, count_in, label_in, beside_in, cost_in, total_in,
-                            chosen_out, found_out, price_out,
+                            p, rows, cols, tile, tiles_x, slots, ordered, count_in, label_in, near_in, cost_in,
+                            total_in, chosen_out, found_out, price_out,
                         )  # fmt: skip
 
     return choose

@@ -18,8 +18,9 @@ from leafflow_ti.stages.planes import round_up
 Image = NDArray[np.float32]
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 """Steps (y, x) of the paths."""
-NEAR, SIDES = 9, 4
-"""As in ``kernels.search``, which loads the engine."""
+STEPS = ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1))
+"""Steps (x, y) from a label to those that count as neighbours, itself the first."""
+NEAR = len(STEPS)
 
 
 @dataclass(frozen=True)
@@ -70,48 +71,34 @@ class Labels:
         return replace(self, values=np.pad(self.values, ((0, 0), (0, more), (0, 0))))
 
     def near(self) -> NDArray[np.int32]:
-        """[tiles, 9, slots, NEAR]: slots of the same label (first; -1 if there is none) and of its neighbours, ended by
-        -1, in the tiles around: row by row, the fifth is the tile itself."""
+        """[tiles, 9, slots, NEAR]: slots of the labels a step away, in the order of ``STEPS``, in the tiles around.
+
+        The tiles stand row by row, the fifth is the tile itself; -1 where there is no such label. Not filled for labels
+        on a line.
+        """
         tiles, slots = len(self.count), self.slots
         table = np.full((tiles, 9, slots, NEAR), -1, np.int32)
+        if self.line:
+            return table
+        # A label as one number, with its tile: what is looked for is found in the sorted list of all.
+        place = np.rint(self.values / self.step).astype(np.int64)
+        side = 2 * int(np.abs(place).max()) + 5
+        code = place[..., 0] * side + place[..., 1] + side * side // 2
+        there = np.arange(slots) < self.count[:, None]
+        keys = np.where(there, np.arange(tiles)[:, None] * side * side + code, tiles * side * side).ravel()
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
         index = np.arange(tiles).reshape(-1, self.tiles_x)
         padded = np.pad(index, 1, constant_values=-1)
         for relation in range(9):
             dy, dx = divmod(relation, 3)
             other = padded[dy : dy + index.shape[0], dx : dx + index.shape[1]].ravel()
-            for one in np.flatnonzero(other >= 0):
-                n, m = self.count[one], self.count[other[one]]
-                gap = np.abs(self.values[one, :n, None] - self.values[other[one], None, :m]).max(axis=2)
-                table[one, relation, :n] = _nearest(gap, self.step)
+            for n, (x, y) in enumerate(STEPS):
+                wanted = other[:, None] * side * side + code + x * side + y
+                found = np.minimum(np.searchsorted(ordered, wanted), ordered.size - 1)
+                hit = there & (other >= 0)[:, None] & (ordered[found] == wanted)
+                table[:, relation, :, n] = np.where(hit, order[found] % slots, -1)
         return table
-
-    def beside(self) -> NDArray[np.int32]:
-        """[tiles, slots, SIDES]: slots of the labels one step before and behind along x, then along y; -1 for none."""
-        table = np.full((len(self.count), self.slots, SIDES), -1, np.int32)
-        if self.line:
-            for one, n in enumerate(self.count):
-                table[one, 1 : n - 1] = np.arange(n)[1:-1, None] + np.array([-1, 1, -1, 1])
-            return table
-        steps = self.step * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
-        for one, n in enumerate(self.count):
-            here = self.values[one, :n]
-            for side, step in enumerate(steps):
-                hit = np.abs(here[:, None] + step - here[None]).max(axis=2) < 0.01 * self.step
-                table[one, :n, side] = np.where(hit.any(axis=1), hit.argmax(axis=1), -1)
-        return table
-
-
-def _nearest(gap: NDArray[np.float64], step: float) -> NDArray[np.int32]:
-    """Rows of ``Labels.near`` from the distances [n, m] of labels."""
-    near = np.full((len(gap), NEAR), -1, np.int32)
-    same = gap < 0.01 * step
-    near[:, 0] = np.where(same.any(axis=1), same.argmax(axis=1), -1)
-    hit = (gap < 1.01 * step) & ~same
-    rows, cols = np.nonzero(hit)
-    rank = np.cumsum(hit, axis=1)[rows, cols]
-    fits = rank < NEAR
-    near[rows[fits], rank[fits]] = cols[fits]
-    return near
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,11 +150,6 @@ def features(image: Image, radius: int, floor: float) -> Image:
     return np.stack([along_x * scale, along_y * scale]).astype(np.float32)
 
 
-def search_bytes(rows: int, cols: int, slots: int) -> int:
-    """Memory of the two volumes of a search, at most."""
-    return 2 * 4 * rows * cols * slots
-
-
 def search(
     device: Device, stack: Image, guide: Image, mask: NDArray[np.bool_], views: Views, labels: Labels, costs: Costs
 ) -> Found:
@@ -207,8 +189,8 @@ def search(
         )  # fmt: skip
     chosen, found, price = device.empty(size, "int"), device.empty(2 * size), device.empty(size)
     winners_kernel(spec)(
-        rows, cols, labels.tile, labels.tiles_x, slots, device.tasks(size), *tables,
-        device.array(labels.beside(), "int"), cost, total, chosen, found, price,
+        rows, cols, labels.tile, labels.tiles_x, slots, int(labels.line), device.tasks(size),
+        *tables, near, cost, total, chosen, found, price,
     )  # fmt: skip
     return Found(
         device.host(chosen).reshape(rows, cols),
