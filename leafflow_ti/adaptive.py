@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from leafflow_ti.capture import Capture
 from leafflow_ti.field import empty_map
-from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.reading import Mask
 from leafflow_ti.refinement import Place, refine_beyond, refine_maps, refined_from, ring
@@ -28,13 +27,14 @@ from leafflow_ti.status import HAS_VALUE, Status
 from leafflow_ti.stays import Maps, Stay, without_images
 from leafflow_ti.surfaces import EDGE, REACH, Surfaces, dilated, vector
 from leafflow_ti.trace import span
+from leafflow_ti.units import Units
 
 Codes = NDArray[np.uint8]
 BEYOND = (Status.BORDER, Status.INCOHERENT, Status.NOT_CONVERGED)
 """Statuses of pixels that the refinement may still have values for: not all images see all of their windows."""
-STRAY = 1.0
+STRAY = 0.75
 """Pixels per step or frame between a measured value and the search's, beyond which it is of another surface, or none:
-the search is good to half a pixel where it is right, and on real images (Tsukuba) it is then right nine times of ten."""
+the search is good to half a pixel where it is right, and there (Tsukuba) it is right nine times of ten."""
 UNDECIDED = -1
 """Instead of the number of a label: no pass gave a value."""
 
@@ -71,10 +71,10 @@ class _Tile:
 
 
 class Adaptive:
-    """Computes units frame by frame, in the way of a ``Pipeline`` whose plan is adaptive."""
+    """Computes the units of an adaptive plan, frame by frame."""
 
-    def __init__(self, pipeline: Pipeline):
-        self.pipeline, self.plan, self.capture = pipeline, pipeline.plan, pipeline.capture
+    def __init__(self, common: Units):
+        self.common, self.plan, self.capture = common, common.plan, common.capture
         margin = 2 * self.plan.margin
         self._band = Band.of(
             self.plan.problem.sampling, self.plan.band_rows + margin, self.plan.tile_cols, self.plan.x.step
@@ -82,24 +82,25 @@ class Adaptive:
 
     def units(self, t_index: int, bands: Iterable[int]) -> Iterator[tuple[Unit, Maps, Codes]]:
         """The units of some bands of one frame."""
-        plan, pipeline = self.plan, self.pipeline
+        plan, common = self.plan, self.common
         frame = plan.frames[t_index]
         with span("search", f"frame {frame}"):
             surfaces = self._surfaces(frame)
         edges = surfaces.near_edges()
         for index in bands:
             with span("host", f"frame {frame}"):
-                y, x = pipeline.around(index)
+                y, x = common.around(index)
                 tiles = self._tiles(y, x, surfaces)
                 maps, codes, chosen = self._measured(tiles, (len(y), len(x)), frame, surfaces)
                 joined = _joined(surfaces.shown[np.ix_(range(4), y, x)])
-                maps, codes = pipeline.framed(index, maps, codes, joined)
+                maps, codes = common.framed(index, maps, codes, joined)
                 if plan.refine:
                     self._refine(tiles, surfaces, frame, maps, codes, chosen)
                     self._drop_strays(maps, codes, surfaces, y, x)
+                    common.settle(maps, codes)
                 codes[(codes == Status.OK) & edges[np.ix_(y, x)]] = Status.CONTESTED
                 self._fill_in(maps, codes, surfaces, y, x)
-                result = pipeline.cut(index, maps, codes)
+                result = common.cut(index, maps, codes)
             yield plan.unit(t_index, index), *result
 
     def _surfaces(self, frame: int) -> Surfaces:
@@ -114,11 +115,11 @@ class Adaptive:
             return capture.read(t, sy, sx, 0, capture.height, 0, capture.width)
 
         coarse = coarse_search(
-            self.pipeline.device, image, extent, reference=capture.reference, frame=frame,
+            self.common.device, image, extent, reference=capture.reference, frame=frame,
             moving="t" in plan.problem.columns.solutions, disparity_range=disparities, motion_range=motions,
-            mask=self.pipeline.mask,
+            mask=self.common.mask,
         )  # fmt: skip
-        return Surfaces(self.pipeline.device, coarse, extent, plan.cameras, capture.reference)
+        return Surfaces(self.common.device, coarse, extent, plan.cameras, capture.reference)
 
     def _strays(self, maps: Maps, surfaces: Surfaces, y: range, x: range) -> Mask:
         """Pixels whose values lie farther from what the search found than a pass can see: they follow something else,
@@ -142,8 +143,8 @@ class Adaptive:
         """What the search found, where nothing better is known."""
         there = np.ix_(y, x)
         empty = np.isin(codes, BEYOND) & surfaces.known[there]
-        if self.pipeline.mask is not None:
-            empty &= self.pipeline.mask[there]
+        if self.common.mask is not None:
+            empty &= self.common.mask[there]
         found = self._shown(surfaces, there)
         if "disparity" in found:
             geometry, axis = self.plan.geometry, surfaces.axis
@@ -176,9 +177,9 @@ class Adaptive:
 
     def _stay(self, tile: _Tile, surfaces: Surfaces, group: Sequence[int], frame: int) -> Stay:
         """The engine at a tile, aimed at the first of some labels, to see their surface alone."""
-        pipeline, aims = self.pipeline, [surfaces.aims[label] for label in group]
-        return pipeline.stays.move(
-            pipeline.engine(self._band), self._band, (tile.x[0], tile.y[0]), aims[0], self._frames(frame).start, frame,
+        common, aims = self.common, [surfaces.aims[label] for label in group]
+        return common.stays.move(
+            common.engine(self._band), self._band, (tile.x[0], tile.y[0]), aims[0], self._frames(frame).start, frame,
             partial(surfaces.layer, aims), partial(surfaces.hidden, aims[0]),
         )  # fmt: skip
 
@@ -190,14 +191,14 @@ class Adaptive:
     def _feed(self, stay: Stay, each: Callable[[int, NDArray[np.float32], Mask], None]) -> None:
         """All frames of the window of a stay, in turn; its engine then speaks of their middle."""
         frames = self._frames(stay.frame)
-        with contextlib.closing(self.pipeline.reader.blocks(frames, stay.box, stay.aim, stay.frame)) as blocks:
+        with contextlib.closing(self.common.reader.blocks(frames, stay.box, stay.aim, stay.frame)) as blocks:
             for t in frames:
                 each(t, *next(blocks))
         stay.engine.set_frame(stay.frame)
 
     def _pass(self, tile: _Tile, surfaces: Surfaces, label: int, frame: int) -> tuple[Maps, Codes]:
         """Maps and status of a tile as one label sees them."""
-        stays, samples = self.pipeline.stays, []
+        stays, samples = self.common.stays, []
         stay = self._stay(tile, surfaces, (label,), frame)
         tensors = None
 
@@ -208,7 +209,7 @@ class Adaptive:
                 samples.append(without_images(sample))
 
         self._feed(stay, push)
-        self.pipeline.device.synchronize()
+        self.common.device.synchronize()
         maps, status = stays.maps(stay, tensors, samples[0])
         inner = (slice(0, len(tile.y)), slice(0, len(tile.x)))
         maps, status = {name: values[inner] for name, values in maps.items()}, status[inner]
@@ -267,7 +268,7 @@ class Adaptive:
         pixels without values, from their neighbours."""
         plan = self.plan
         stay = self._stay(tile, surfaces, group, frame)
-        self._feed(stay, partial(self.pipeline.stays.refine_alone, stay))
+        self._feed(stay, partial(self.common.stays.refine_alone, stay))
         assert stay.engine.refine is not None
         assert plan.refine is not None
         part = {name: values[tile.place].copy() for name, values in maps.items()}
@@ -279,7 +280,7 @@ class Adaptive:
         else:
             status[~mine] = Status.NOT_COMPUTED
             effort = refine_maps(stay.engine.refine, plan.refine, part, status, place)
-        self.pipeline.effort += effort
+        self.common.effort += effort
         codes[tile.place][mine] = status[mine]
         for name, values in part.items():
             maps[name][tile.place][mine] = values[mine]
