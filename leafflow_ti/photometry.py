@@ -12,7 +12,7 @@ from leafflow_ti.matching import structure
 
 Floats = NDArray[np.float64]
 
-LEAST_IMAGES = 5
+LEAST_IMAGES = 7
 """Images of one sensor from which a pixel that does not work can be told from the scene."""
 SURE = 8.0
 """Standard errors by which such a pixel differs from its neighbours."""
@@ -79,8 +79,18 @@ def defects(images: Sequence[Floats], noise: float) -> NDArray[np.intp]:
 
 
 def _against_neighbours(image: Floats) -> Floats:
-    """Difference of every pixel from the median of its eight neighbours."""
+    """Difference of every pixel from the mean of two opposite neighbours, the pair that it is nearest to.
+
+    A line of the scene along the cameras' own would stay where it is; it agrees with the neighbours along it.
+    """
     padded = np.pad(np.nan_to_num(image), 1, mode="reflect")
     rows, cols = image.shape
-    around = [padded[1 + j : 1 + j + rows, 1 + i : 1 + i + cols] for j in (-1, 0, 1) for i in (-1, 0, 1) if i or j]
-    return np.asarray(np.nan_to_num(image) - np.median(around, axis=0))
+
+    def neighbour(j: int, i: int) -> Floats:
+        return padded[1 + j : 1 + j + rows, 1 + i : 1 + i + cols]
+
+    pairs = [
+        neighbour(0, 0) - 0.5 * (neighbour(j, i) + neighbour(-j, -i)) for j, i in ((0, 1), (1, 0), (1, 1), (1, -1))
+    ]
+    nearest = np.argmin(np.abs(pairs), axis=0)
+    return np.asarray(np.take_along_axis(np.stack(pairs), nearest[None], axis=0)[0])

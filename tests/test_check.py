@@ -183,6 +183,9 @@ def test_defects_need_a_moving_scene_and_enough_images() -> None:
         image[20, 30] = 255.0
     assert defects(images, 1.0).tolist() == [[20, 30]]
     assert defects(images[:4], 1.0).size == 0
+    for image in images:
+        image[40] = 200.0  # a line along the cameras' own
+    assert defects(images, 1.0).tolist() == [[20, 30]]
 
 
 def test_robust_solution_forgets_a_third_of_the_rows() -> None:

@@ -53,7 +53,7 @@ def format_report(found: Report) -> list[str]:
     if found.motion_px is not None:
         lines.append(f"motion       up to {found.motion_px:.2f} px per frame")
     lines += [f"{one.kind:<12} {one.text}" for one in found.advice] or ["fine         nothing to change"]
-    if not found.fine and found.positions_line is not None:
+    if found.positions_line is not None and any("positions_mm" in one.text for one in found.advice):
         lines += ["[grid]", found.positions_line]
     return lines
 
