@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from leafflow_ti.config import RunConfig, load_config
     from leafflow_ti.engines import release
     from leafflow_ti.field import Field
+    from leafflow_ti.inspection import check
     from leafflow_ti.results import ResultStore
     from leafflow_ti.rig import Rig, plan_rig
 
@@ -25,11 +26,11 @@ _HOME = {
     "estimate": "api", "plan_run": "api", "run": "api",
     "Capture": "capture", "Geometry": "capture", "capture_from_array": "capture", "open_capture": "capture",
     "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
-    "Rig": "rig", "plan_rig": "rig",
+    "check": "inspection", "Rig": "rig", "plan_rig": "rig",
     "release": "engines",
 }  # fmt: skip
 __all__ = [
-    "Capture", "Field", "Geometry", "ResultStore", "Rig", "RunConfig", "capture_from_array", "estimate",
+    "Capture", "Field", "Geometry", "ResultStore", "Rig", "RunConfig", "capture_from_array", "check", "estimate",
     "load_config", "open_capture", "plan_rig", "plan_run", "release", "run",
 ]  # fmt: skip
 

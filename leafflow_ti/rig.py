@@ -220,7 +220,7 @@ def _plan(rig: Rig, config: RunConfig) -> Plan:
     output = config.output.model_copy(
         update={"roi": (x, y, x + 1, y + 1), "frames": None, "mask": None, "arrays": None}
     )
-    preshift = rig.preshift if config.preshift == "auto" else config.preshift
+    preshift = rig.preshift if isinstance(config.preshift, str) else config.preshift
     found = make_plan(capture, config.model_copy(update={"model": model, "output": output, "preshift": preshift}))
     stride, reach = found.x.step, AROUND * found.x.step
     around = tuple(range(middle - reach, middle + reach + 1, stride) for middle in (x, y))

@@ -54,7 +54,7 @@ TRIALS = (
     Trial("depth, 3x3 cameras", replace(_TABLE, rows=3, cols=3, frames=1), {"model": "depth", **SMALL}),
     Trial(
         "tobacco rig, window 65",
-        replace(_TABLE, f_px=25 / 0.0044, baseline_mm=(1.0, 1.0), distance_mm=250.0, cols=9, frames=9, size=(441, 237),
+        replace(_TABLE, f_px=25 / 0.0044, baseline_mm=(1.0, 1.0), distance_mm=250.0, cols=9, frames=9, size=(521, 333),
                 noise=1.0, contrast=30.0, wavelengths_px=(6.0, 18.0), slopes=(0.0, 0.5), velocity=(0.01, 0.0, 0.0)),
         {"refine": 0},
     ),

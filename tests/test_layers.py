@@ -42,8 +42,10 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("stays", "units", "surfaces", "adaptive"), 6),
     **dict.fromkeys(("refinement", "refine_work"), 6),
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
+    **dict.fromkeys(("matching", "positions", "photometry"), 3),
     **dict.fromkeys(("expected",), 6),
-    **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "rig", "rig_choices"), 7),
+    **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases"), 7),
+    **dict.fromkeys(("rig", "rig_choices", "inspection", "inspection_advice", "inspection_report"), 7),
     **dict.fromkeys(("cli",), 8),
 }
 """Part of the package -> layer. A part imports from lower layers and, without cycles, from its own."""

@@ -31,8 +31,7 @@ UNSURE = 2
 
 
 def resample(read: ReadWindow, size: tuple[int, int], y: Floats, x: Floats, dtype: npt.DTypeLike) -> tuple[Array, Mask]:
-    """Grey values at the places ``y``, ``x`` (one shape, inside the image), and which of them do not rest on values
-    that are not finite.
+    """Grey values at the places ``y``, ``x`` (one shape, inside the image), and which of them rest on numbers alone.
 
     ``size``: (height, width) of the image, of which ``read`` gives windows.
     """
