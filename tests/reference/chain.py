@@ -121,8 +121,8 @@ def shares(columns: ColumnSet):
     return T
 
 
-def unshifted(P, cov, columns: ColumnSet, motion=(0.0, 0.0)):
-    """The same for images that were not shifted by ``motion`` px per frame: p_t = p'_t - m · (p_x, p_y)."""
+def unsheared(columns: ColumnSet, motion):
+    """T [n_flow, n_flow] with p = T p' but for the flow itself."""
     T = np.eye(columns.n_flow)
     for channel in ("x", "y", "i"):
         t = columns.index(channel, "t")
@@ -130,6 +130,12 @@ def unshifted(P, cov, columns: ColumnSet, motion=(0.0, 0.0)):
             at = columns.index(channel, o)
             if t is not None and at is not None:
                 T[t, at] -= m
+    return T
+
+
+def unshifted(P, cov, columns: ColumnSet, motion=(0.0, 0.0)):
+    """The same for images that were not shifted by ``motion`` px per frame: p_t = p'_t - m · (p_x, p_y)."""
+    T = unsheared(columns, motion)
     moved = T @ P
     if "t" in columns.solutions:
         k = columns.solutions.index("t")

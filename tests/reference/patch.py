@@ -1,7 +1,7 @@
 """Naive float64 twin of what follows the flow parameters: geometry, the fit of the motion, every map of a pixel."""
 
 import numpy as np
-from reference.chain import solution_noise
+from reference.chain import solution_noise, unsheared
 
 from leafflow_ti.kernels.patch_fit import HELD
 from leafflow_ti.models import AXES, ColumnSet
@@ -241,6 +241,7 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
         shared = shared_covariance(
             found_own.J, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
         ) * (found_own.rho * np.sqrt(solved.variance[k] * s2[0]))
+        shared = unsheared(columns, view.motion_px) @ shared @ unsheared(flows.columns, view.motion_px).T
         return found, shared @ E.T
 
     def fit(sets, which, common):
