@@ -20,8 +20,8 @@ from leafflow_ti.plan import Plan, make_plan
 from leafflow_ti.runtime import start
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.tensor import Band
-from leafflow_ti.stays import without_images
 from leafflow_ti.status import HAS_VALUE
+from leafflow_ti.stays import without_images
 
 MOTION = (1, -1)
 X, Y, FRAME = 47, 39, 3
