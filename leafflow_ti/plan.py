@@ -16,6 +16,7 @@ from leafflow_ti.capture import (
     Capture,
     Geometry,
     UnclearDisparity,
+    anything_fits,
     find_preshift,
     one_preshift_serves,
 )
@@ -363,7 +364,7 @@ def _preshift(capture: Capture, config: RunConfig, cameras: bool, time: bool) ->
     try:
         found = _uniform(capture, config) if cameras else (0, 0)
     except UnclearDisparity:
-        if config.preshift != "auto":
+        if config.preshift != "auto" or not anything_fits(capture):
             raise
         return (0, 0), True
     return found, config.preshift == "auto" and not one_preshift_serves(capture, found, time)

@@ -13,7 +13,7 @@ from leafflow_ti.capture.channels import ImageInfo
 from leafflow_ti.capture.description import Camera, Description, Grid, Images, Time, write_description
 from leafflow_ti.capture.images import probe, read_gray
 from leafflow_ti.capture.preshift import UnclearDisparity, find_preshift
-from leafflow_ti.capture.spread import one_preshift_serves
+from leafflow_ti.capture.spread import anything_fits, one_preshift_serves
 
 __all__ = [
     "DEFAULT_CACHE_BYTES",
@@ -28,6 +28,7 @@ __all__ = [
     "Images",
     "Time",
     "UnclearDisparity",
+    "anything_fits",
     "capture_from_array",
     "find_preshift",
     "one_preshift_serves",
