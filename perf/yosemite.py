@@ -29,8 +29,9 @@ FRAME_NUMBER = 9
 
 COMMON: dict[str, Any] = {
     "model": "flow-affine", "taps": "7", "taps_time": "7", "size_time": 9, "sigma_time": 3.0, "border": "clip",
+    "preshift": "uniform",
 }  # fmt: skip
-"""All 15 frames are used: 7 taps and a window of 9."""
+"""All 15 frames are used: 7 taps and a window of 9. No motion is taken out beforehand, as none was in print."""
 PLAIN = {"window": 27}
 """Best of windows of 15 to 51 pixels."""
 SETTINGS_NOTE = (

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from leafflow_ti.filters import FILTER_SETS
 from perf import yosemite
 from perf.cases import Options
 from perf.figures import Figure, Outcome
 from perf.inputs import absent
 from perf.pictures import Panel, draw
 
+SETS = ("3x1x1", "3", "5", "7")
+"""Those of the table."""
 PRINTED = 3.1
 """Mean angular error [deg] at full density that is printed for the best of the table; the others are not at hand."""
 
@@ -41,7 +42,7 @@ def run_settings(settings: Settings, out: Path) -> Outcome:
     truth, folder = yosemite.Truth.read(), out / "yosemite"
     figures, panels = [], []
     means: dict[str, dict[str, float]] = {}
-    for taps in FILTER_SETS:
+    for taps in SETS:
         for estimator in settings.estimators:
             field = yosemite.estimate_flow(
                 folder, **yosemite.PLAIN, taps=taps, taps_time=taps, stride=settings.stride, estimator=estimator
@@ -51,11 +52,11 @@ def run_settings(settings: Settings, out: Path) -> Outcome:
             ground = np.count_nonzero(~truth.sky[np.ix_(field.y, field.x)])
             means.setdefault(estimator, {})[taps] = float(known.mean())
             note = f"± {known.std():.2f}, median {np.median(known):.2f}, density {100 * known.size / ground:.1f} %"
-            high = PRINTED if taps == FILTER_SETS[-1] else None
+            high = PRINTED if taps == SETS[-1] else None
             figures.append(Figure(f"{taps} taps, {estimator}", float(known.mean()), "deg", high, "printed", note=note))
             if estimator == settings.estimators[-1]:
                 panels.append(Panel(f"{taps} taps, {estimator}: angular error [deg]", error, (0, 20), "magma"))
-    worst = max(mean[longer] / mean[shorter] for mean in means.values() for shorter, longer in pairwise(FILTER_SETS))
+    worst = max(mean[longer] / mean[shorter] for mean in means.values() for shorter, longer in pairwise(SETS))
     figures.append(Figure("longer filters over the next shorter ones, largest of all estimators", worst, "x", 1.0))
     notes = (
         "printed at full density; here pixels whose windows do not move as one have no value: see the densities",
