@@ -119,6 +119,9 @@ class Adaptive:
             moving="t" in plan.problem.columns.solutions, disparity_range=disparities, motion_range=motions,
             mask=self.common.mask,
         )  # fmt: skip
+        after = -self.common.reader.elapsed(frame, frame)  # that results lie behind the frame that was searched
+        if after:
+            coarse = coarse.later(after, extent.toward)
         return Surfaces(self.common.device, coarse, extent, plan.cameras, capture.reference)
 
     def _strays(self, maps: Maps, surfaces: Surfaces, y: range, x: range) -> Mask:
@@ -292,8 +295,9 @@ def extent_of(plan: Plan, capture: Capture) -> Extent:
     rows, cols = (n if several else 1 for n, several in zip((capture.n_rows, capture.n_cols), read, strict=True))
     geometry = plan.geometry
     return Extent(
-        capture.n_frames, rows, cols, capture.height, capture.width, geometry.baseline_mm, geometry.disparity_offset_px
-    )
+        capture.n_frames, rows, cols, capture.height, capture.width, geometry.baseline_mm,
+        geometry.disparity_offset_px, capture.frame_times,
+    )  # fmt: skip
 
 
 def _best(passes: list[tuple[Maps, Codes]], tile: _Tile, surfaces: Surfaces) -> NDArray[np.int64]:
