@@ -164,15 +164,14 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
         raise ConfigError("no pixel can be measured: the window reaches beyond the images everywhere: make it smaller")
     compiling = pipeline.warm_up()
     least = pipeline.least_seconds()
-    t = plan.problem.sampling.t
-    last = plan.frames[-1] + t.after + 1
-    alone = range(max(plan.frames[0] - t.before, last - ALONE_FRAMES), last)
+    last = plan.frames[-1] + plan.around[1] + 1
+    alone = range(max(plan.frames[0] - plan.around[0], last - ALONE_FRAMES), last)
     background = {s: n / len(alone) for s, n in pipeline.read_alone(band, alone).items()}
     measured = min(frames, len(plan.frames))
     background["write"] = _run_units(pipeline, band, measured)
     if trace_file is not None:
         trace.write(trace_file)
-    steps = _Steps.of(trace.events or [], t.before + t.after)
+    steps = _Steps.of(trace.events or [], sum(plan.around))
     seconds = statistics.median(steps.units)
     pixels = (plan.band(band).stop - plan.band(band).start) * len(plan.x)
     ceilings = measure_ceilings(device)
@@ -224,7 +223,7 @@ def predict(
     ``fill``, ``unit``: seconds of the two, waiting included; ``stages``: of a unit. Filling and filters grow with the
     rows of images, the rest with the rows of output that are computed; a band that is all border costs nothing.
     """
-    plan, t = pipeline.plan, pipeline.plan.problem.sampling.t
+    plan = pipeline.plan
     filters = sum(stages.get(s, 0.0) for s in ("prefilter", "filter", "splines"))
     n = len(plan.frames)
     seconds, read = compiling, 0
@@ -234,7 +233,7 @@ def predict(
         if rows:
             wide = _image_rows(plan.problem.sampling, rows, plan) / _image_rows(plan.problem.sampling, high, plan)
             seconds += wide * (fill + n * filters) + n * (unit - filters) * rows / high
-            read += n + t.before + t.after
+            read += n + sum(plan.around)
     return Prediction(n, plan.bands, plan.n_units, read, seconds)
 
 

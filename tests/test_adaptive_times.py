@@ -39,7 +39,8 @@ def images(times: tuple[float, ...], px: float) -> np.ndarray:
 
 @pytest.mark.parametrize("refine", [0, 3])
 @pytest.mark.parametrize(
-    ("times", "frame", "px", "options"), [(GAP, 3, 4.0, {"taps_time": "3", "size_time": 1}), (PAIR, 0, 6.0, {})]
+    ("times", "frame", "px", "options"),
+    [(GAP, 3, 4.0, {"taps_time": "3", "size_time": 1, "refine_frames": (2, 2)}), (PAIR, 0, 6.0, {})],
 )
 def test_fast_motion_at_measured_times(
     times: tuple[float, ...], frame: int, px: float, options: dict[str, Any], refine: int

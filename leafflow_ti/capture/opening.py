@@ -36,7 +36,8 @@ def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Fi
     if path.is_dir():
         path = path / FILE_NAME
     description = read_description(path)
-    layout = find_layout(description.images, path.parent)
+    time = description.time
+    layout = find_layout(description.images, path.parent, gaps=time is not None and bool(time.stamps_s or time.stamps))
     info = layout.info
     n_frames, n_rows, n_cols = layout.file.shape
     bits = description.images.bit_depth or info.bits
