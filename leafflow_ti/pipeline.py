@@ -20,6 +20,7 @@ from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
 from leafflow_ti.refinement import Place, refine_maps, refine_middle
 from leafflow_ti.runtime import Device
+from leafflow_ti.search import warm_up
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.stays import Maps, Stay, without_images
 from leafflow_ti.trace import Trace, active, span
@@ -44,6 +45,8 @@ class Pipeline(Units):
         # The work on the tiny band is no stage of its own: it all counts as compiling.
         with active(None), self.trace.span("compile"), quick_front_end():
             self._one_pixel(None)
+            if self.plan.adaptive:
+                warm_up(self.device)
         return self.trace.seconds["compile"]
 
     def least_seconds(self) -> dict[str, float]:

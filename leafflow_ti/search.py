@@ -171,6 +171,15 @@ def coarse_search(
     return Coarse(disparity, motion, known)
 
 
+def warm_up(device: Device) -> None:
+    """Compile the kernels of a search, of any capture, with tiny images."""
+    noise = np.random.default_rng(0).standard_normal((24, 40)).astype(np.float32)
+    coarse_search(
+        device, lambda *key: noise, Extent(2, 1, 2, 24, 40), reference=(0, 1), frame=0, disparity_range=(-2.0, 0.0),
+        motion_range=1.0,
+    )  # fmt: skip
+
+
 def peak_bytes(image: tuple[int, int]) -> int:
     """Memory of a search in images [rows, cols], at most: two volumes, features of all views, and the images."""
     reduction = max(1.0, image[0] * image[1] * SLOTS / VOLUME)

@@ -330,7 +330,7 @@ def test_the_same_frames_give_the_same_refinement(capture: Capture) -> None:
     alone = lf.estimate(capture, 3, **{**FEW, "refine": 12})
     ok = (three.status == Status.OK) & (five.status == Status.OK) & (alone.status == Status.OK)
     assert ok.sum() > 40
-    for name in ("depth", "velocity_x", "velocity_z", "omega_z"):
+    for name in ("depth", "velocity_x", "velocity_z", "rotation_z"):
         bar = five[f"{name}_std"][ok]
         assert np.quantile(np.abs(three[name] - five[name])[ok] / bar, 0.9) < 0.05, name
         assert np.median(np.abs(alone[name] - five[name])[ok] / bar) > 0.2, name
