@@ -119,6 +119,9 @@ class Adaptive:
             moving="t" in plan.problem.columns.solutions, disparity_range=disparities, motion_range=motions,
             mask=self.common.mask,
         )  # fmt: skip
+        after = -self.common.reader.elapsed(frame, frame)  # that results lie behind the frame that was searched
+        if after:
+            coarse = coarse.later(after, extent.toward)
         return Surfaces(self.common.device, coarse, extent, plan.cameras, capture.reference)
 
     def _strays(self, maps: Maps, surfaces: Surfaces, y: range, x: range) -> Mask:
@@ -178,19 +181,17 @@ class Adaptive:
     def _stay(self, tile: _Tile, surfaces: Surfaces, group: Sequence[int], frame: int) -> Stay:
         """The engine at a tile, aimed at the first of some labels, to see their surface alone."""
         common, aims = self.common, [surfaces.aims[label] for label in group]
+        first = frame - self.plan.problem.sampling.t.before
         return common.stays.move(
-            common.engine(self._band), self._band, (tile.x[0], tile.y[0]), aims[0], self._frames(frame).start, frame,
+            common.engine(self._band), self._band, (tile.x[0], tile.y[0]), aims[0], first, frame,
             partial(surfaces.layer, aims), partial(surfaces.hidden, aims[0]),
         )  # fmt: skip
 
-    def _frames(self, frame: int) -> range:
-        """Those that a measurement needs."""
-        t = self.plan.problem.sampling.t
-        return range(frame - t.before, frame + t.after + 1)
-
-    def _feed(self, stay: Stay, each: Callable[[int, NDArray[np.float32], Mask], None]) -> None:
-        """All frames of the window of a stay, in turn; its engine then speaks of their middle."""
-        frames = self._frames(stay.frame)
+    def _feed(
+        self, stay: Stay, around: tuple[int, int], each: Callable[[int, NDArray[np.float32], Mask], None]
+    ) -> None:
+        """So many frames before and behind that of a stay, in turn; its engine then speaks of that."""
+        frames = range(stay.frame - around[0], stay.frame + around[1] + 1)
         with contextlib.closing(self.common.reader.blocks(frames, stay.box, stay.aim, stay.frame)) as blocks:
             for t in frames:
                 each(t, *next(blocks))
@@ -204,11 +205,13 @@ class Adaptive:
 
         def push(t: int, block: NDArray[np.float32], finite: Mask) -> None:
             nonlocal tensors
-            sample, tensors = stays.push(stay, t, block, finite, refining=False)
+            sample = stays.sample(stay, t, block, finite, refining=False)
+            tensors = stay.engine.push(sample)
             if t == frame:
                 samples.append(without_images(sample))
 
-        self._feed(stay, push)
+        time = self.plan.problem.sampling.t
+        self._feed(stay, (time.before, time.after), push)
         self.common.device.synchronize()
         maps, status = stays.maps(stay, tensors, samples[0])
         inner = (slice(0, len(tile.y)), slice(0, len(tile.x)))
@@ -268,7 +271,7 @@ class Adaptive:
         pixels without values, from their neighbours."""
         plan = self.plan
         stay = self._stay(tile, surfaces, group, frame)
-        self._feed(stay, partial(self.common.stays.refine_alone, stay))
+        self._feed(stay, plan.around, partial(self.common.stays.refine_alone, stay))
         assert stay.engine.refine is not None
         assert plan.refine is not None
         part = {name: values[tile.place].copy() for name, values in maps.items()}
@@ -292,8 +295,9 @@ def extent_of(plan: Plan, capture: Capture) -> Extent:
     rows, cols = (n if several else 1 for n, several in zip((capture.n_rows, capture.n_cols), read, strict=True))
     geometry = plan.geometry
     return Extent(
-        capture.n_frames, rows, cols, capture.height, capture.width, geometry.baseline_mm, geometry.disparity_offset_px
-    )
+        capture.n_frames, rows, cols, capture.height, capture.width, geometry.baseline_mm,
+        geometry.disparity_offset_px, capture.frame_times,
+    )  # fmt: skip
 
 
 def _best(passes: list[tuple[Maps, Codes]], tile: _Tile, surfaces: Surfaces) -> NDArray[np.int64]:

@@ -192,7 +192,8 @@ def _provenance(plan: Plan, capture: Capture, device: Device, contents: bool = T
     return {
         "config": plan.config.to_toml(),
         "plan": {
-            "model": plan.model, "preshift_px": list(plan.preshift), "bands": plan.bands,
+            "model": plan.model, "bands": plan.bands,
+            "preshift_px": "adaptive" if plan.adaptive else list(plan.preshift),
             "f_px": g.f_px, "principal_px": list(g.principal_px), "baseline_mm": list(g.baseline_mm),
             "disparity_offset_px": list(g.disparity_offset_px), "time_offset": plan.time_offset,
         },

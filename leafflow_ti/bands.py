@@ -45,7 +45,7 @@ class Demand:
     """What decides the memory of a unit. ``cols``: output columns; ``n_cameras`` are read, ``n_maps`` written.
 
     ``tile_cols``: of a tile where the images are shifted tile by tile, 0 elsewhere; ``image``: rows and columns of an
-    image, where it is searched.
+    image, where it is searched. ``waiting``: frames that the model takes later than the refinement.
     """
 
     config: RunConfig
@@ -58,6 +58,7 @@ class Demand:
     cols: int
     tile_cols: int = 0
     image: tuple[int, int] = (0, 0)
+    waiting: int = 0
 
     def coefficients(self, rows: int) -> int:
         """Spline coefficients of the refinement for units of ``rows`` rows."""
@@ -101,7 +102,7 @@ class Demand:
             total += peak_bytes(self.image) + 4 * maps * (LABELS_AT_ONCE * band.rows * band.cols + rows * self.cols)
             total += self.n_cameras * in_rows * in_cols * HIDING_BYTES
         # One frame and one unit are worked on, and one unit is being written.
-        return total + (1 + ahead) * block + (2 + WRITE_BEHIND) * unit
+        return total + (1 + ahead + self.waiting) * block + (2 + WRITE_BEHIND) * unit
 
     def _band(self, rows: int) -> Band:
         """Two more rows and columns for the growth at the edges, and for the start of a refinement there."""

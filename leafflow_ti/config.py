@@ -110,6 +110,7 @@ KEYWORDS: dict[str, str] = {
     "refine": "refine.steps",
     "refine_window": "refine.window",
     "thin": "refine.thin",
+    "refine_frames": "refine.frames",
     **{name: f"plan.{name}" for name in PlanSection.model_fields},
     **{name: f"output.{name}" for name in OutputSection.model_fields},
 }

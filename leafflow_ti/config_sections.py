@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_valida
 
 from leafflow_ti.config_values import (
     auto_or_integer,
+    before_and_behind,
     increasing,
     integer,
     machine_memory,
@@ -56,6 +57,7 @@ _AutoCount = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 
 _AutoSteps = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 0, high=50))]
 _AutoDegree = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, 5, odd=True, high=7))]
 _AutoRefined = Annotated[int | Auto, BeforeValidator(lambda v: auto_or_integer(v, REFINED_WINDOW, odd=True))]
+_AutoFrames = Annotated[tuple[int, int] | Auto, BeforeValidator(before_and_behind)]
 _AutoRange = Annotated[tuple[float, float] | Auto, BeforeValidator(increasing)]
 _Noise = Annotated[float | Auto, BeforeValidator(noise_or_auto)]
 _Width = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -178,13 +180,15 @@ class RefineSection(Section):
 
     "auto": ``steps`` as the preset has them for affine-scene-flow, else 0; ``window``: that of the model; ``thin``:
     some 21 samples across the window, or more where the preset says so, and every second one for one camera;
-    ``spline``: the degree of the interpolation, 7 with precision f64.
+    ``spline``: the degree of the interpolation, 7 with precision f64; ``frames`` before and behind the reference frame
+    that it takes: those under filters and window of the model.
     """
 
     steps: _AutoSteps = "auto"
     window: _AutoRefined = "auto"
     thin: _AutoCount = "auto"
     spline: _AutoDegree = "auto"
+    frames: _AutoFrames = "auto"
 
 
 class PlanSection(Section):

@@ -82,6 +82,20 @@ def increasing(value: object) -> object:
     return found
 
 
+def before_and_behind(value: object) -> object:
+    """Two numbers of frames of ``"1,2"`` or ``[1, 2]``, one for both of them, or ``"auto"``; else ValueError."""
+    if value == "auto":
+        return value
+    parts = value.split(",") if isinstance(value, str) else value if isinstance(value, list | tuple) else (value,)
+    try:
+        found = tuple(integer(part, 0) for part in parts)
+    except ValueError:
+        found = ()
+    if len(found) not in (1, 2):
+        raise ValueError('must be frames before and behind, N or A,B, or "auto"')
+    return found[0], found[-1]
+
+
 def _number(value: object) -> float:
     """A number as people write it; else NaN."""
     try:

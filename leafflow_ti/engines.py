@@ -27,7 +27,8 @@ KEPT_BYTES = 512 << 20
 class Engine:
     """The stages for bands of one size: prefilter, tensors of the reference model and of the own flows, estimate.
 
-    ``key``: what they depend on. ``widening``: pixels that the refinement needs around the block of the tensors.
+    ``key``: what they depend on; ``around``: frames before and behind the reference that the refinement takes;
+    ``widening``: pixels that the refinement needs around the block of the tensors.
     """
 
     key: tuple[Any, ...]
@@ -37,6 +38,7 @@ class Engine:
     ranges: RangeEngine | None = None
     refine: RefineStage | None = None
     widening: int = 0
+    around: tuple[int, int] = (0, 0)
 
     @classmethod
     def of(cls, device: Device, plan: Plan, band: Band, view: Callable[[int], View], apart: bool) -> Engine:
@@ -44,7 +46,7 @@ class Engine:
         problem, filters = plan.problem, plan.config.filters
         key = (
             device, replace(problem, noise=0.0), plan.layout, band, plan.differences, filters.prefilter,
-            filters.sigma_pre, apart, plan.refine,
+            filters.sigma_pre, apart, plan.refine, plan.around,
         )  # fmt: skip
         kept = _take(key)
         if kept is not None and not plan.ranges:
@@ -64,7 +66,7 @@ class Engine:
         if filters.prefilter != "none":
             prefilter = Prefilter(device, filters.prefilter, filters.sigma_pre, rows, cols)
         estimate = EstimateStage(device, problem, plan.layout, first, plan.differences, apart, tensor.sources)
-        return cls(key, prefilter, tensor, estimate, ranges, refine, widening)
+        return cls(key, prefilter, tensor, estimate, ranges, refine, widening, plan.around)
 
     def reset(self, first: int = 0) -> None:
         """Forget all frames; the next one pushed is the frame ``first``."""
@@ -77,7 +79,7 @@ class Engine:
         self.estimate.set_frame(frame)
         t = self.estimate.problem.sampling.t
         if self.refine and t.uneven:
-            self.refine.set_frames(tuple(t.positions.tolist()))
+            self.refine.set_frames(tuple(t.around(*self.around).tolist()))
 
     def push(self, sample: Sample) -> Any | None:
         """Add a frame of every camera; the tensors once the windows are full."""

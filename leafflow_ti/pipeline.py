@@ -20,6 +20,7 @@ from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
 from leafflow_ti.refinement import Place, refine_maps, refine_middle
 from leafflow_ti.runtime import Device
+from leafflow_ti.search import warm_up
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.stays import Maps, Stay, without_images
 from leafflow_ti.trace import Trace, active, span
@@ -44,6 +45,8 @@ class Pipeline(Units):
         # The work on the tiny band is no stage of its own: it all counts as compiling.
         with active(None), self.trace.span("compile"), quick_front_end():
             self._one_pixel(None)
+            if self.plan.adaptive:
+                warm_up(self.device)
         return self.trace.seconds["compile"]
 
     def least_seconds(self) -> dict[str, float]:
@@ -79,6 +82,9 @@ class Pipeline(Units):
             if engine.refine:
                 refine_middle(engine.refine)
 
+        if engine.refine:  # it may look farther than the model
+            for _ in range(sum(plan.around)):
+                engine.refine.push(wide, np.ones(wide.shape, bool))
         while (tensors := one_more()) is None:
             pass
         estimate(tensors)
@@ -122,20 +128,28 @@ class Pipeline(Units):
             for t_index in range(first, last + 1):
                 yield plan.unit(t_index, index), *self.cut(index, *self.framed(index))
             return
-        latency, before = plan.problem.sampling.t.after, plan.problem.sampling.t.before
-        frames = range(plan.frames[first] - before, plan.frames[last] + latency + 1)
-        stay, aim = self._move(index, frames.start), Aim(plan.preshift)
-        waiting: deque[Sample] = deque(maxlen=latency + 1)
+        time, (before, after) = plan.problem.sampling.t, plan.around
+        frames = range(plan.frames[first] - before, plan.frames[last] + after + 1)
+        begin = plan.frames[first] - time.before  # the refinement may look farther than the model, to both sides
+        stay, aim = self._move(index, begin), Aim(plan.preshift)
+        ahead: deque[Sample] = deque()
+        waiting: deque[Sample] = deque(maxlen=time.after + 1)
         with contextlib.closing(self.reader.blocks(frames, stay.box, aim)) as blocks:
             for t in frames:
                 with span("host", f"frame {t}"):
-                    sample, tensors = self.stays.push(stay, t, *next(blocks))
+                    ahead.append(self.stays.sample(stay, t, *next(blocks)))
+                    if len(ahead) <= after - time.after:
+                        continue
+                    sample = ahead.popleft()
+                    if t - (after - time.after) < begin:
+                        continue
+                    tensors = stay.engine.push(sample)
                     waiting.append(without_images(sample))
                     del sample
                     if tensors is None:
                         continue
                     self.device.synchronize()
-                    stay.engine.set_frame(t - latency)
+                    stay.engine.set_frame(t - after)
                     maps, codes = self.framed(index, *self.stays.maps(stay, tensors, waiting[0]))
                     if stay.engine.refine and plan.refine:
                         y, x = self.around(index)
@@ -143,7 +157,7 @@ class Pipeline(Units):
                         self.effort += refine_maps(stay.engine.refine, plan.refine, maps, codes, place)
                         self.settle(maps, codes)
                     result = self.cut(index, maps, codes)
-                yield plan.unit(first + t - latency - plan.frames[first], index), *result
+                yield plan.unit(first + t - after - plan.frames[first], index), *result
 
     def _move(self, index: int, first: int = 0) -> Stay:
         """Bring an engine, all frames forgotten, to the measurable rectangle of a band; ``first``: the next frame."""

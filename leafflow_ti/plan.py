@@ -28,7 +28,7 @@ from leafflow_ti.model_plan import cameras_read, check_model, fitted_motion, mod
 from leafflow_ti.models import MODELS, TensorLayout
 from leafflow_ti.noise import noise_level
 from leafflow_ti.range_plan import RangePlan, range_problem
-from leafflow_ti.refine_plan import Refinement, plan_refinement
+from leafflow_ti.refine_plan import Refinement, frames_around, plan_refinement
 from leafflow_ti.sampling import AxisSampling
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, WORLD_MAPS, Problem
@@ -74,6 +74,8 @@ class Plan:
     tile_cols: int = 0
     """Output columns of a tile where every frame is searched for what whole-pixel shift each pixel needs; 0: one
     ``preshift`` serves all."""
+    around: tuple[int, int] = (0, 0)
+    """Frames before and behind a reference frame that its results need."""
 
     @property
     def adaptive(self) -> bool:
@@ -272,18 +274,20 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
             "refinement (--refine 3)"
         )
     motion = fitted_motion(config, name)
-    preshift, ranges, noise = (0, 0), None, noise_level(capture, config)
+    preshift, ranges, noise, around = (0, 0), None, noise_level(capture, config), (0, 0)
     adaptive = False
     if model.ranges:
         depth = None if config.range_flow.depth else model_problem(capture, static(config), "depth", None)
         own = replace(depth, noise=noise) if depth else None
         preshift = _uniform(capture, config) if own else (0, 0)
         alone = sampling_of(capture, config, "reference", True)
-        frames = _frames(capture, config, alone.t)
+        around = frames_around(config, alone.t)
+        frames = _frames(capture, config, around)
         problem, ranges = range_problem(capture, config, alone, frames, own, preshift, noise)
     else:
         problem = model_problem(capture, config, name, motion)
-        frames = _frames(capture, config, problem.sampling.t if model.time else None)
+        around = frames_around(config, problem.sampling.t) if model.time else (0, 0)
+        frames = _frames(capture, config, around)
         preshift, adaptive = _preshift(capture, config, bool(problem.camera_axes), model.time)
     problem = replace(problem, noise=noise)
     layout = TensorLayout.of(problem.columns)
@@ -299,16 +303,18 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     steps_x, steps_y = capture.camera_steps
     refine = plan_refinement(
         config,
-        _farthest(problem.sampling.t, frames) if model.time else None,
+        _farthest(problem.sampling.t, around, frames) if model.time else None,
         [(float(steps_x[sy, sx]), float(steps_y[sy, sx])) for sy in cameras[0] for sx in cameras[1]],
         (capture.height, capture.width),
     )
     plan = Plan(
         config, name, problem, layout, _geometry(capture),
         cameras, preshift, frames, y, x, len(y), 0, 0, 0, noise, ranges, refine,
+        around=around,
     )  # fmt: skip
     depths = (0,) if isinstance(capture, ArrayCapture) else range(READ_AHEAD, -1, -1)
     demand = Demand(config, problem, layout, ranges, refine, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))
+    demand = replace(demand, waiting=around[1] - problem.sampling.t.after)
     if adaptive:
         demand = replace(
             demand, tile_cols=min(len(x), -(-TILE_PIXELS // stride)), image=(capture.height, capture.width)
@@ -317,32 +323,30 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     plan = replace(plan, band_rows=band_rows, bytes=memory, read_ahead=ahead, tile_cols=demand.tile_cols)
     cache = capture.cacheable_bytes if plan.bands > 1 or adaptive else 0
     if adaptive:  # of the frames that one measurement needs: they come again for every tile and label
-        cache = cache * min(capture.n_frames, 2 * problem.sampling.t.radius + 2) // capture.n_frames
+        cache = cache * min(capture.n_frames, sum(around) + 2) // capture.n_frames
     if cache > min(DEFAULT_CACHE_BYTES, usable_memory(config) - memory):
         cache = 0
     return replace(plan, bytes=memory + cache, cache_bytes=cache)
 
 
-def _frames(capture: Capture, config: RunConfig, time: AxisSampling | None) -> tuple[int, ...]:
-    """Frames that are measured; ``time``: the sampling along time, None without."""
+def _frames(capture: Capture, config: RunConfig, around: tuple[int, int]) -> tuple[int, ...]:
+    """Frames that are measured: those wanted that have so many before and behind them."""
     wanted = config.output.frame_range(capture.n_frames)
-    if time is None:
-        return tuple(wanted)
-    first, end = time.before, capture.n_frames - time.after
+    first, end = around[0], capture.n_frames - around[1]
     frames = tuple(t for t in wanted if first <= t < end)
     if not frames:
         raise ConfigError(
-            f"output.frames = {config.output.frames!r}: the temporal window reaches from {time.before} frames before "
-            f"to {time.after} behind, so frames {first}:{end} can be measured"
+            f"output.frames = {config.output.frames!r}: the temporal window reaches from {around[0]} frames before "
+            f"to {around[1]} behind, so frames {first}:{end} can be measured"
         )
     return frames
 
 
-def _farthest(time: AxisSampling, frames: tuple[int, ...]) -> tuple[float, ...]:
-    """Offsets of the frames of a window; where they differ from one reference to the next, the farthest."""
+def _farthest(time: AxisSampling, around: tuple[int, int], frames: tuple[int, ...]) -> tuple[float, ...]:
+    """Offsets of the frames around a reference; where they differ from one to the next, the farthest."""
     if not time.uneven:
-        return tuple(time.positions.tolist())
-    found = (tuple(time.about(t).positions.tolist()) for t in frames)
+        return tuple(time.around(*around).tolist())
+    found = (tuple(time.about(t).around(*around).tolist()) for t in frames)
     return max(found, key=lambda offsets: max(map(abs, offsets)))
 
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import math
 import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +18,12 @@ from leafflow_ti.api import create_store, start_device
 from leafflow_ti.background import Behind
 from leafflow_ti.bands import WRITE_BEHIND
 from leafflow_ti.capture import Capture
-from leafflow_ti.ceilings import Ceilings, measure_ceilings
+from leafflow_ti.ceilings import measure_ceilings
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan, Unit, make_plan
-from leafflow_ti.refine_plan import Effort
+from leafflow_ti.profile_report import Prediction, Profile, StageCost
 from leafflow_ti.refine_work import count_refinement
 from leafflow_ti.results import ResultStore
 from leafflow_ti.runtime import Device
@@ -46,75 +44,6 @@ _BESIDE = {"read": "disk", "write": "disk", "decode": "decoding", "prefilter": "
 """What limits a stage whose work is not counted."""
 
 Result = tuple[Unit, Maps, NDArray[np.uint8]]
-
-
-@dataclass(frozen=True)
-class StageCost:
-    """One stage for one unit in the middle of a sequence.
-
-    ``seconds``; ``us_per_pixel`` of the unit; ``share`` of the time on the clock (stages beside the computing may hide
-    behind it). Where the stage's work is counted: ``flops_per_pixel``, what it reached, ``gflops`` [10^9/s] and
-    ``gbytes`` [10^9 bytes/s], and their shares of what the machine can do. ``limit``: "launches" where a single pixel
-    takes half as long, else the ceiling that is nearer, "compute" or "memory"; "disk" or "decoding" beside the
-    computing.
-    """
-
-    stage: str
-    seconds: float
-    us_per_pixel: float
-    share: float
-    limit: str
-    flops_per_pixel: float | None = None
-    gflops: float | None = None
-    gbytes: float | None = None
-    share_of_flops: float | None = None
-    share_of_bytes: float | None = None
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """The whole run: ``frames`` of output, each in ``bands``, together ``units``; ``seconds``: with compiling.
-
-    ``frames_read``: blocks of images that are read and filtered, those that fill the windows of each band included.
-    """
-
-    frames: int
-    bands: int
-    units: int
-    frames_read: int
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Profile:
-    """What was measured. ``unit``: rows and columns of output pixels; ``seconds_per_unit`` on the clock, in the middle
-    of a sequence; ``fill_seconds``: for the frames that fill the windows before the first unit; ``overlap``: share of
-    reading, decoding and writing that computing does not wait for, None where they cost nothing; ``planned_bytes`` of
-    the arrays, ``peak_bytes`` of the process, measurement included (None where the system does not tell); ``effort`` of
-    the refinement per output pixel, None without one.
-    """
-
-    model: str
-    device: str
-    unit: tuple[int, int]
-    frames_measured: int
-    compile_seconds: float
-    seconds_per_unit: float
-    pixels_per_second: float
-    fill_seconds: float
-    stages: tuple[StageCost, ...]
-    limit: str
-    overlap: float | None
-    planned_bytes: int
-    peak_bytes: int | None
-    ceilings: Ceilings
-    prediction: Prediction
-    effort: Effort | None
-
-    def to_json(self) -> dict[str, Any]:
-        """As JSON values; what is not known is null."""
-        found: dict[str, Any] = _without_nan(asdict(self))
-        return found
 
 
 @dataclass(frozen=True)
@@ -145,7 +74,8 @@ class _Steps:
 
 
 def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Path | None = None) -> Profile:
-    """Measure the first ``frames`` units of the highest band of a run, after compiling.
+    """Measure the first ``frames`` units of the highest band of a run, after compiling; whole frames where each is
+    searched.
 
     ``trace_file``: where the spans of that go (see ``Trace.write``). Nothing else is left behind: units are written to
     a temporary folder. Raises as ``run`` does, ConfigError where no pixel can be measured, RunError where
@@ -158,21 +88,22 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
         trace.write(trace_file)  # better refused now than after the work
     capture.keep_decoded(plan.cache_bytes)
     pipeline = Pipeline(plan, capture, device, trace)
+    if plan.adaptive:
+        return _profile_frames(pipeline, frames, trace_file)
     band = max(range(plan.bands), key=lambda b: _height(pipeline.extent(b)))
     rows, cols = pipeline.extent(band)
     if not _height((rows, cols)):
         raise ConfigError("no pixel can be measured: the window reaches beyond the images everywhere: make it smaller")
     compiling = pipeline.warm_up()
     least = pipeline.least_seconds()
-    t = plan.problem.sampling.t
-    last = plan.frames[-1] + t.after + 1
-    alone = range(max(plan.frames[0] - t.before, last - ALONE_FRAMES), last)
+    last = plan.frames[-1] + plan.around[1] + 1
+    alone = range(max(plan.frames[0] - plan.around[0], last - ALONE_FRAMES), last)
     background = {s: n / len(alone) for s, n in pipeline.read_alone(band, alone).items()}
     measured = min(frames, len(plan.frames))
-    background["write"] = _run_units(pipeline, band, measured)
+    background["write"] = _run_units(pipeline, {plan.unit(t, band).index for t in range(measured)})
     if trace_file is not None:
         trace.write(trace_file)
-    steps = _Steps.of(trace.events or [], t.before + t.after)
+    steps = _Steps.of(trace.events or [], sum(plan.around))
     seconds = statistics.median(steps.units)
     pixels = (plan.band(band).stop - plan.band(band).start) * len(plan.x)
     ceilings = measure_ceilings(device)
@@ -201,6 +132,43 @@ def profile(capture: Capture, config: RunConfig, frames: int = 5, trace_file: Pa
     )  # fmt: skip
 
 
+def _profile_frames(pipeline: Pipeline, frames: int, trace_file: Path | None) -> Profile:
+    """Of a plan that searches every frame: the first ``frames`` whole ones. What they cost depends on how many surfaces
+    they show, so that the work is not counted, and reading is what it was beside the computing."""
+    plan, trace, device = pipeline.plan, pipeline.trace, pipeline.device
+    compiling = pipeline.warm_up()
+    measured = min(frames, len(plan.frames))
+    writing = plan.bands * _run_units(pipeline, {unit.index for unit in plan.units() if unit.t_index < measured})
+    if trace_file is not None:
+        trace.write(trace_file)
+    events = [e for e in trace.events or [] if e.stage != "compile"]
+    begun = sorted(e.start for e in events if e.stage == "search")
+    thread = next(e.thread for e in events if e.stage == "search")
+    begun.append(max(e.start + e.duration for e in events if e.thread == thread))
+    seconds = statistics.median((b - a) / 1e9 for a, b in itertools.pairwise(begun))
+    spent, waits = {"write": writing}, dict[str, float]()
+    for e in events:
+        into, key = (waits, e.label) if e.stage == "wait" else (spent, e.stage)
+        if e.stage != "write":
+            into[key] = into.get(key, 0.0) + e.own / 1e9 / measured
+    pixels = len(plan.y) * len(plan.x)
+    stages = tuple(
+        StageCost(s, spent[s], spent[s] / pixels * 1e6, spent[s] / seconds, _BESIDE.get(s, ""))
+        for s in STAGES if s in spent
+    )  # fmt: skip
+    longest = max((c for c in stages if c.stage not in BACKGROUND_STAGES), key=lambda c: c.seconds).stage
+    background = {s: spent[s] for s in BACKGROUND_STAGES if s in spent}
+    blocks = sum(e.stage == "decode" for e in events) // (len(plan.cameras[0]) * len(plan.cameras[1]))
+    n = len(plan.frames)
+    whole = Prediction(n, plan.bands, plan.n_units, round(blocks / measured * n), compiling + n * seconds)
+    return Profile(
+        plan.model, str(device), (len(plan.y), len(plan.x)), measured, compiling, seconds, pixels / seconds, 0.0,
+        stages, _waited_for(stages, waits, seconds) or longest, _overlap(background, waits), plan.bytes,
+        _peak_bytes(), measure_ceilings(device), whole,
+        pipeline.effort.per(measured * pixels) if plan.refine else None, searched=True,
+    )  # fmt: skip
+
+
 def _share_of_solving(plan: Plan, capture: Capture, device: Device, band: int) -> float:
     """The part of ``solve`` in the stage ``estimate``, from a unit for which the two are launched apart.
 
@@ -224,7 +192,7 @@ def predict(
     ``fill``, ``unit``: seconds of the two, waiting included; ``stages``: of a unit. Filling and filters grow with the
     rows of images, the rest with the rows of output that are computed; a band that is all border costs nothing.
     """
-    plan, t = pipeline.plan, pipeline.plan.problem.sampling.t
+    plan = pipeline.plan
     filters = sum(stages.get(s, 0.0) for s in ("prefilter", "filter", "splines"))
     n = len(plan.frames)
     seconds, read = compiling, 0
@@ -234,7 +202,7 @@ def predict(
         if rows:
             wide = _image_rows(plan.problem.sampling, rows, plan) / _image_rows(plan.problem.sampling, high, plan)
             seconds += wide * (fill + n * filters) + n * (unit - filters) * rows / high
-            read += n + t.before + t.after
+            read += n + sum(plan.around)
     return Prediction(n, plan.bands, plan.n_units, read, seconds)
 
 
@@ -249,10 +217,9 @@ def _image_rows(sampling: Sampling, rows: int, plan: Plan) -> int:
     return Band.of(sampling, rows, 1, plan.x.step).in_rows
 
 
-def _run_units(pipeline: Pipeline, band: int, frames: int) -> float:
-    """Compute and write the first units of a band; seconds of writing one while nothing else goes on."""
+def _run_units(pipeline: Pipeline, wanted: set[int]) -> float:
+    """Compute and write the units ``wanted``; seconds of writing one while nothing else goes on."""
     plan = pipeline.plan
-    wanted = {plan.unit(t, band).index for t in range(frames)}
     last: list[Result] = []
     with tempfile.TemporaryDirectory(prefix="leafflow-ti-profile-") as folder:
         store = create_store(Path(folder) / "out.zarr", plan, {}, pipeline.capture)
@@ -289,13 +256,18 @@ def _rated(cost: StageCost, work: Work, reached: Rate, least: float) -> StageCos
 
 def _limit(stages: Sequence[StageCost], waits: Mapping[str, float], clock: float) -> str:
     """What limits the whole: reading or writing where computing waits for it, else what limits the longest stage."""
-    by_name = {cost.stage: cost for cost in stages}
-    if sum(waits.values()) > WAITING_SHARE * clock:
-        label = max(waits, key=lambda name: waits[name])
-        if label == "wait for images" and by_name["decode"].seconds > by_name["read"].seconds:
-            return "decoding"
-        return "disk"
-    return max((c for c in stages if c.stage not in BACKGROUND_STAGES and c.limit), key=lambda c: c.seconds).limit
+    computing = (c for c in stages if c.stage not in BACKGROUND_STAGES and c.limit)
+    return _waited_for(stages, waits, clock) or max(computing, key=lambda c: c.seconds).limit
+
+
+def _waited_for(stages: Sequence[StageCost], waits: Mapping[str, float], clock: float) -> str:
+    """What computing waits for, "disk" or "decoding"; "" if it does not wait for long."""
+    if sum(waits.values()) <= WAITING_SHARE * clock:
+        return ""
+    by_name = {cost.stage: cost.seconds for cost in stages}
+    label = max(waits, key=lambda name: waits[name])
+    slow = label == "wait for images" and by_name["decode"] > by_name.get("read", 0.0)
+    return "decoding" if slow else "disk"
 
 
 def _overlap(background: Mapping[str, float], waits: Mapping[str, float]) -> float | None:
@@ -311,11 +283,3 @@ def _peak_bytes() -> int | None:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -14,6 +14,7 @@ from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, STRAIN_NAMES
 from leafflow_ti.models import MODELS
 from leafflow_ti.presets import REFINED_WINDOW
+from leafflow_ti.sampling import AxisSampling
 from leafflow_ti.splines import filter_radius, support
 
 PIXEL_VARIANCE = 1 / 12
@@ -154,6 +155,27 @@ def samples_across(size: int, thin: int) -> int:
     return 2 * (size // 2 // thin) + 1
 
 
+def frames_around(config: RunConfig, time: AxisSampling) -> tuple[int, int]:
+    """Frames before and behind a reference frame that its results need, by the model's ``time`` and the refinement.
+
+    Raises ConfigError where the refinement is to take fewer than the model.
+    """
+    wanted, needed = config.refine.frames, (time.before, time.after)
+    if not config.refine.steps or isinstance(wanted, str):
+        return needed
+    if MODELS[config.model.name].ranges:
+        raise ConfigError(
+            f"refine.frames = {wanted[0]},{wanted[1]}: model 'range-flow' is refined with the frames of its own "
+            "window: leave it out"
+        )
+    if wanted[0] < needed[0] or wanted[1] < needed[1]:
+        raise ConfigError(
+            f"refine.frames = {wanted[0]},{wanted[1]}: the model looks at {needed[0]} frames before and {needed[1]} "
+            "behind already: choose at least these, or fewer --taps-time or a smaller --size-time"
+        )
+    return wanted
+
+
 def plan_refinement(
     config: RunConfig,
     temporal: tuple[float, ...] | None,
@@ -162,8 +184,9 @@ def plan_refinement(
 ) -> Refinement | None:
     """The refinement that a resolved configuration asks for; None: none.
 
-    ``temporal``: offsets of the frames under filters and window of the model, None if it is static; ``cameras``: as of
-    ``Refinement``, all that are read; ``image``: rows and columns. Raises ConfigError where they do not fit.
+    ``temporal``: offsets of the frames around the reference (``frames_around``), None if the model is static;
+    ``cameras``: as of ``Refinement``, all that are read; ``image``: rows and columns. Raises ConfigError where they do
+    not fit.
     """
     model, window, cameras = config.model, config.window, tuple(cameras)
     steps, size, thin = (int(value) for value in (config.refine.steps, config.refine.window, config.refine.thin))
@@ -189,6 +212,8 @@ def plan_refinement(
             f"deformation '{model.deformation}': model '{model.name}' is static: choose deformation none, or a model "
             "with time"
         )
+    if temporal is None and config.refine.frames != "auto":
+        raise ConfigError(f"refine.frames: model '{model.name}' is static: leave it out, or choose a model with time")
     if size > min(image):
         raise ConfigError(
             f"refine.window = {size}: the images have {image[1]} x {image[0]} pixels: choose a --refine-window of at "

@@ -96,7 +96,11 @@ class AxisSampling:
     @property
     def positions(self) -> Array:
         """Of all samples that are needed, from where the results lie: [before + 1 + after], in nominal steps."""
-        return np.asarray(np.arange(-self.before, self.after + 1) - self.halfway, np.float64)
+        return self.around(self.before, self.after)
+
+    def around(self, before: int, after: int) -> Array:
+        """Of so many samples before and behind the reference sample: [before + 1 + after], in nominal steps."""
+        return np.asarray(np.arange(-before, after + 1) - self.halfway, np.float64)
 
     @property
     def offsets(self) -> Array:

@@ -49,6 +49,10 @@ LEAST_TEXTURE = 0.02
 """Standard deviation, in units of that of the whole image, below which texture counts as noise."""
 FADED = 0.2
 """Mean square of features below which there is no texture: of noise alone it is .5."""
+FARTHEST = 1.5
+"""How much later or earlier than the nearer frame beside it, relatively, the other one may be to be compared, too."""
+SETTLING = 4
+"""Rounds in which it is found where a pixel has come from."""
 COSTS = Costs()
 
 
@@ -56,7 +60,8 @@ COSTS = Costs()
 class Extent:
     """Size of a capture, and how its grid sees depth.
 
-    ``baseline`` (bx, by): camera step [mm]; ``offset`` (ox, oy) [px/step]: total disparity less the seen one.
+    ``baseline`` (bx, by): camera step [mm]; ``offset`` (ox, oy) [px/step]: total disparity less the seen one;
+    ``times`` of the frames in nominal intervals, () if they are even.
     """
 
     n_frames: int
@@ -66,11 +71,25 @@ class Extent:
     width: int
     baseline: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
+    times: tuple[float, ...] = ()
+
+    def neighbours(self, frame: int) -> dict[int, float]:
+        """Frames before and behind one, and how much later they were taken [nominal intervals]; one that is far more
+        than the other is left out: what it shows has changed the more."""
+        times = self.times or tuple(float(t) for t in range(self.n_frames))
+        later = {t: times[t] - times[frame] for t in (frame + 1, frame - 1) if 0 <= t < self.n_frames}
+        nearest = min(map(abs, later.values()))
+        return {t: by for t, by in later.items() if abs(by) <= FARTHEST * nearest}
 
     @property
     def axis(self) -> int:
         """The main axis, 0 for x, 1 for y: x if the grid has columns."""
         return 0 if self.n_cols > 1 or self.n_rows == 1 else 1
+
+    @property
+    def toward(self) -> float:
+        """Sign of the disparities of what is near."""
+        return -float(np.sign(self.baseline[self.axis])) or 1.0
 
     def per_step(self, disparity: NDArray[Any]) -> NDArray[np.float64]:
         """[n, 2]: displacement (x, y) per camera step along x and along y, of disparities [n] along the main axis."""
@@ -84,12 +103,41 @@ class Coarse:
     """What the reference camera sees at one frame.
 
     ``disparity`` [H, W] px per camera step along the main axis, as seen in the images; 0 for one camera. ``motion``
-    [2, H, W] px per frame (x, y); 0 for one frame. ``known`` [H, W]: where both could be decided.
+    [2, H, W] px per nominal interval (x, y); 0 for one frame. ``known`` [H, W]: where both could be decided.
     """
 
     disparity: Image
     motion: Image
     known: Mask
+
+    def later(self, by: float, toward: float) -> Coarse:
+        """What the camera sees ``by`` intervals later, if all goes on moving; ``toward``: sign of nearer disparities.
+
+        Every pixel goes where its motion leads, the nearest one wins. What comes to light then is not known.
+        """
+        shape = self.known.shape
+        there = np.indices(shape)
+        size = np.array(shape)[:, None, None]
+
+        def moved(source: NDArray[np.intp]) -> NDArray[np.intp]:
+            """Where the pixels ``source`` [2, H, W] (y, x) are then."""
+            motion = self.motion[::-1, source[0], source[1]]
+            return np.asarray(np.rint(source + np.float32(by) * motion), np.intp)
+
+        # Pixels that none goes to: gaps in what spreads, and what comes to light.
+        source = there
+        for _ in range(SETTLING):
+            source = np.clip(there - (moved(source) - source), 0, size - 1)
+        lit = np.abs(moved(source) - there).max(axis=0) > 1
+        order = np.argsort(np.where(self.known, toward * self.disparity, -np.inf), axis=None, kind="stable")
+        begin = there.reshape(2, -1)[:, order]
+        end = moved(there).reshape(2, -1)[:, order]
+        inside = ((end >= 0) & (end < size[:, 0])).all(axis=0)
+        to = tuple(end[:, inside])
+        source[:, to[0], to[1]] = begin[:, inside]  # of several the last one, the nearest
+        lit[to] = False
+        at = tuple(source)
+        return Coarse(self.disparity[at], self.motion[:, at[0], at[1]], self.known[at] & ~lit)
 
 
 def coarse_search(
@@ -121,6 +169,15 @@ def coarse_search(
         motion, seen = _Flow(*task).search(most)
         known = known & seen
     return Coarse(disparity, motion, known)
+
+
+def warm_up(device: Device) -> None:
+    """Compile the kernels of a search, of any capture, with tiny images."""
+    noise = np.random.default_rng(0).standard_normal((24, 40)).astype(np.float32)
+    coarse_search(
+        device, lambda *key: noise, Extent(2, 1, 2, 24, 40), reference=(0, 1), frame=0, disparity_range=(-2.0, 0.0),
+        motion_range=1.0,
+    )  # fmt: skip
 
 
 def peak_bytes(image: tuple[int, int]) -> int:
@@ -239,8 +296,7 @@ class _Stereo(_Search):
         axis = self.extent.axis
         size = self.extent.width if axis == 0 else self.extent.height
         widest = WIDEST * size
-        toward = -float(np.sign(self.extent.baseline[axis])) or 1.0
-        far = -self.extent.offset[axis]
+        toward, far = self.extent.toward, -self.extent.offset[axis]
         low, high = sorted((far - 2.0 * toward, far + widest * toward))
         rough = int(np.ceil(min(self.extent.height, self.extent.width) / ROUGH_SIZE))
         scale = max(self.scale_for(ROUGH_LABELS), rough)
@@ -272,17 +328,23 @@ class _Flow(_Search):
     """Motions among candidates, tile by tile: peaks of local correlations first, then what the pixels around chose."""
 
     def search(self, most: float) -> tuple[Image, Mask]:
-        """Motion [2, H, W] px/frame and where it is known."""
+        """Motion [2, H, W] px per nominal interval, ``most`` at most, and where it is known."""
         scale = self.scale_for(SLOTS)
-        signs = [sign for sign in (1, -1) if 0 <= self.frame + sign < self.extent.n_frames]
-        views = Views.of([[(float(sign), float(sign))] for sign in signs])
-        reach = max(1, int(np.ceil(most / scale)))
-        seen = self.prepared([(self.frame + sign, *self.reference) for sign in signs], scale)
-        labels = tiled(proposals(seen.stack, signs, reach), CANDIDATE_TILE, seen.guide.shape, reach)
+        # Searched in pixels from the frame to the nearer one beside it.
+        later = self.extent.neighbours(self.frame)
+        interval = min(map(abs, later.values()))
+        factors = [by / interval for by in later.values()]
+        views = Views.of([[(factor, factor)] for factor in factors])
+        reach = max(1, int(np.ceil(most * interval / scale)))
+        seen = self.prepared([(t, *self.reference) for t in later], scale)
+        # Correlations are added up where lags mean the same in both.
+        alike = [k for k, factor in enumerate(factors) if (abs(factor) - 1.0) * reach <= 0.5]
+        first = proposals(seen.stack[[0, *(k + 1 for k in alike)]], [int(np.sign(factors[k])) for k in alike], reach)
+        labels = tiled(first, CANDIDATE_TILE, seen.guide.shape, reach)
         for tile, unit in REFINING:
             found, _ = self.choose(seen, views, labels)
             labels = tiled(votes(found.displacement / unit, tile), tile, seen.guide.shape, reach, unit)
         found, explained = self.choose(seen, views, labels)
         shape = (self.extent.height, self.extent.width)
-        motion = np.stack([enlarged(m, scale, shape) for m in found.displacement]) * np.float32(scale)
+        motion = np.stack([enlarged(m, scale, shape) for m in found.displacement]) * np.float32(scale / interval)
         return motion, enlarged(explained, scale, shape)

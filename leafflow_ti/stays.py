@@ -112,15 +112,10 @@ class Stays:
             engine, aim, wide.widened(margin), wide, block, inner, allowed, centre, frame, shown, hidden
         )  # fmt: skip
 
-    def push(
-        self, stay: Stay, t: int, block: NDArray[Any], finite: Mask, refining: bool = True
-    ) -> tuple[Sample, Any | None]:
-        """Add a frame, as it was read, to the engine: what it was, and the tensors once the windows are full.
-
-        ``refining``: whether the refinement takes it, too.
-        """
-        sample = self._sample(stay, t, *self._prepared(stay, t, block, finite, refining))
-        return sample, stay.engine.push(sample)
+    def sample(self, stay: Stay, t: int, block: NDArray[Any], finite: Mask, refining: bool = True) -> Sample:
+        """What the tensor stages take of a frame, as it was read. ``refining``: whether the refinement takes it, too,
+        at once."""
+        return self._sample(stay, t, *self._prepared(stay, t, block, finite, refining))
 
     def refine_alone(self, stay: Stay, t: int, block: NDArray[Any], finite: Mask) -> None:
         """Add a frame for the refinement alone."""

@@ -50,7 +50,7 @@ class Surfaces:
         """Labels, and the number [H, W] of each pixel's."""
         axis = extent.axis
         self._many = extent.n_cols * extent.n_rows > 1
-        toward = -float(np.sign(extent.baseline[axis])) or 1.0
+        toward = extent.toward
         self._nearness = np.where(coarse.known, self.shown[axis] * np.float32(toward), np.float32(-1e9))
         self.axis, self._toward = axis, toward
         """The main axis of the grid, 0 for x."""

@@ -27,6 +27,7 @@ STAGES: dict[str, str] = {
     "read": "bytes from disk",
     "decode": "bytes to blocks of grey values",
     "wait": "computing has nothing to do: images are not there yet, or results not yet written",
+    "search": "disparities and motions of a whole image, coarsely",
     "prefilter": "filter of every image against uneven light",
     "filter": "derivatives, products, sums over cameras and frames",
     "tensor": "windows along y and x: structure tensors",

@@ -149,11 +149,9 @@ class UnevenSampling(AxisSampling):
         """See ``AxisSampling``; in nominal steps."""
         return 0.0 if self.taps % 2 else self.origin - self.places[self.centre]
 
-    @property
-    def positions(self) -> Array:
+    def around(self, before: int, after: int) -> Array:
         """See ``AxisSampling``."""
-        first = self.centre - self.before
-        return np.array(self.places[first : first + self.before + 1 + self.after]) - self.origin
+        return np.array(self.places[self.centre - before : self.centre + after + 1]) - self.origin
 
     def _under(self, sample: int) -> tuple[float, ...]:
         """Places under the filters of a sample, counted from the reference sample."""

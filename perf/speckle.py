@@ -16,15 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.special import erf  # type: ignore[import-untyped]
 
-from leafflow_ti.api import estimate, start_device
-from leafflow_ti.capture import ArrayCapture, FileCapture, Geometry, capture_from_array
-from leafflow_ti.config import load_config
-from leafflow_ti.config_sections import SIGMA_PER_SIZE
+from leafflow_ti.api import estimate
+from leafflow_ti.capture import ArrayCapture, FileCapture, capture_from_array
 from leafflow_ti.field import Field
-from leafflow_ti.refine_plan import Refinement
-from leafflow_ti.refinement import Place, refine_maps
-from leafflow_ti.stages.estimate import View
-from leafflow_ti.stages.refine import RefineStage
 from leafflow_ti.status import Status
 from perf.cases import Options
 from perf.fields import Array
@@ -49,17 +43,11 @@ STRAIN = {"strain_xx": 2.00e-4, "strain_yy": 1.33e-4, "strain_xy": 0.0}
 
 
 def plate(folder: Path, rendered: Sequence[int]) -> FileCapture:
-    """The first camera's evenly spaced frames ``rendered``; the ``capture.toml`` is written into ``folder``."""
-    step = rendered[1] - rendered[0] if len(rendered) > 1 else 1
+    """The first camera's frames ``rendered`` at their times; the ``capture.toml`` is written into ``folder``."""
     pattern = str(data_folder(NAME) / "hydro_cam0_frame{t:02d}.tiff")
-    images = {"pattern": pattern, "select": {"t": [rendered[0], rendered[-1], step]}}
-    return described(folder / "-".join(map(str, rendered)), {"images": images})
-
-
-def plate_images(folder: Path) -> Array:
-    """All images [t, y, x] of the first camera; ``folder`` as of ``plate``."""
-    captures = [plate(folder, [k]) for k in RENDERED]
-    return np.stack([c.read(0, 0, 0, 0, c.height, 0, c.width) for c in captures])
+    images = {"pattern": pattern, "select": {"t": [rendered[0], rendered[-1]]}}
+    time = {"stamps_s": [float(k) for k in rendered], "interval_s": float(PER_FRAME)}
+    return described(folder / "-".join(map(str, rendered)), {"images": images, "time": time})
 
 
 def plate_truth(name: str) -> float:
@@ -73,28 +61,18 @@ def one_camera(images: Array) -> ArrayCapture:
     return capture_from_array(np.asarray(images, np.float32)[:, None, None])
 
 
-def measure_plate(folder: Path, window: int, stride: int, **options: Any) -> Field:
-    """The reference frame from three frames, at temporal filters of three taps."""
+def measure_plate(
+    folder: Path, window: int, stride: int, rendered: Sequence[int] = RENDERED[:3], **options: Any
+) -> Field:
+    """The second of the frames ``rendered``, from temporal filters of three taps."""
     return estimate(
-        plate(folder, RENDERED[:3]), frame=1, model="flow-affine", window=window, stride=stride, **options
+        plate(folder, rendered), frame=1, model="flow-affine", taps_time="3", size_time=1, window=window, stride=stride,
+        **options,
     )  # fmt: skip
 
 
-def refine_plate(folder: Path, start: Field, window: int, steps: int = 8) -> Field:
-    """The exact refinement with all four frames at their times, from what three of them gave."""
-    images = plate_images(folder)
-    times = tuple((k - REFERENCE) / PER_FRAME for k in RENDERED)
-    height, width = images.shape[1:]
-    plan = Refinement(steps, window, window * SIGMA_PER_SIZE, 1, times, ((0, 0),), 9, 3, 0, flat=True)
-    device = start_device(load_config())
-    view = View(1.0, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 0, 0, 1, height, width, width)
-    stage = RefineStage(device, plan, view, height, width)
-    for image in images.astype(device.real("storage")):
-        stage.push(image[None, None], np.ones((1, 1, height, width), bool))
-    maps, status = {name: values.copy() for name, values in start.items()}, start.status.copy()
-    y, x = (range(int(p[0]), int(p[-1]) + 1, int(p[1] - p[0])) for p in (start.y, start.x))
-    refine_maps(stage, plan, maps, status, Place(y, x, (0, 0), Geometry(1.0, (0.0, 0.0))))
-    return Field(maps, status, start.y, start.x, start.frame)
+ALL_FRAMES: dict[str, Any] = {"rendered": RENDERED, "refine": 8, "refine_frames": (1, 2)}
+"""Of ``measure_plate``: filters see three frames, the refinement sees the fourth one, too, at its own time."""
 
 
 def plate_errors(field: Field) -> dict[str, Array]:
@@ -107,9 +85,7 @@ def plate_figures(folder: Path, stride: int) -> list[Figure]:
     """Mean and scatter of the errors over the plate, by how it is measured."""
     fields = {f"three frames, window {w}": measure_plate(folder, w, stride) for w in (33, 49, 65)}
     fields["three frames, window 65, refined"] = measure_plate(folder, 65, stride, refine=8)
-    fields["four frames at their times, window 65, refined"] = refine_plate(
-        folder, fields["three frames, window 65"], 65
-    )
+    fields["four frames at their times, window 65, refined"] = measure_plate(folder, 65, stride, **ALL_FRAMES)
     found = []
     for label, field in fields.items():
         ok = field.status == Status.OK

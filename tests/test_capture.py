@@ -268,6 +268,22 @@ def test_a_failed_load_can_be_tried_again() -> None:
     assert cache.get("a", lambda: np.ones(2, np.uint8)).sum() == 2
 
 
+def test_frames_with_stamps_may_have_gaps_in_their_numbers(tmp_path: Path) -> None:
+    """Each has a time of its own; without stamps the numbers are the times, and images are missing."""
+    numbers = (0, 4, 8, 10)
+    for t in numbers:
+        tifffile.imwrite(tmp_path / f"f{t:02d}.tif", np.full((8, 9), t, np.uint8))
+    text = '[images]\npattern = "f{t:02d}.tif"\n[time]\n'
+    (tmp_path / "capture.toml").write_text(text + "stamps_s = [0.0, 4.0, 8.0, 10.0]\n", encoding="utf-8")
+    capture = open_capture(tmp_path)
+    assert capture.frames == numbers
+    assert capture.frame_times == (0.0, 1.0, 2.0, 2.5)
+    assert [int(capture.read(t, 0, 0, 0, 1, 0, 1)[0, 0]) for t in range(4)] == list(numbers)
+    (tmp_path / "capture.toml").write_text(text + "interval_s = 4.0\n", encoding="utf-8")
+    with pytest.raises(InputError, match="2 of 6 images are missing"):
+        open_capture(tmp_path)
+
+
 def test_missing_images_are_named(folder: Path) -> None:
     for name in ("row0/c01_001.tif", "row1/c03_002.tif"):
         (folder / name).unlink()

@@ -54,6 +54,10 @@ def capture() -> Capture:
     return capture_of(SCENE)
 
 
+FEW: dict[str, Any] = {**OPTIONS, "taps_time": "3", "size_time": 1}
+"""Filters that see three frames."""
+
+
 def measure(capture: Capture, **options: Any) -> lf.Field:
     return lf.estimate(capture, 3, **{**OPTIONS, **options})
 
@@ -301,3 +305,33 @@ def test_resumed_run_ends_with_the_same_bytes(capture: Capture, tmp_path: Path) 
     assert files_of(tmp_path / "out.zarr") == files_of(tmp_path / "whole.zarr")
     store = lf.ResultStore.open(tmp_path / "out.zarr")
     assert_same(store.field(list(store.frames).index(3)), measure(capture, tile=4))
+
+
+@pytest.mark.parametrize("frames", [(2, 2), (1, 3)])
+def test_the_refinement_takes_more_frames_than_the_filters(
+    capture: Capture, tmp_path: Path, frames: tuple[int, int]
+) -> None:
+    """Sliding through the sequence or not, it sees the same images."""
+    options = {**FEW, "refine_frames": frames}
+    lf.run(capture, tmp_path / "out.zarr", load_config(overrides=options))
+    store = lf.ResultStore.open(tmp_path / "out.zarr")
+    assert store.frames == tuple(range(frames[0], 7 - frames[1]))
+    for index, frame in enumerate(store.frames):
+        assert_same(store.field(index), lf.estimate(capture, frame, **options))
+
+
+def test_the_same_frames_give_the_same_refinement(capture: Capture) -> None:
+    """Filters of three and of five taps start it differently: it ends at the same place, within rounding and what its
+    last step leaves; three frames alone end elsewhere, with twice the error bars of the velocity."""
+    three, five = (
+        lf.estimate(capture, 3, **{**OPTIONS, "refine": 12, "size_time": 1, "taps_time": taps, "refine_frames": more})
+        for taps, more in (("3", 2), ("5", "auto"))
+    )
+    alone = lf.estimate(capture, 3, **{**FEW, "refine": 12})
+    ok = (three.status == Status.OK) & (five.status == Status.OK) & (alone.status == Status.OK)
+    assert ok.sum() > 40
+    for name in ("depth", "velocity_x", "velocity_z", "rotation_z"):
+        bar = five[f"{name}_std"][ok]
+        assert np.quantile(np.abs(three[name] - five[name])[ok] / bar, 0.9) < 0.05, name
+        assert np.median(np.abs(alone[name] - five[name])[ok] / bar) > 0.2, name
+    assert np.median((alone["velocity_x_std"] / five["velocity_x_std"])[ok]) > 1.7

@@ -188,12 +188,39 @@ def test_times_need_not_be_whole() -> None:
         ({}, {"refine_window": 97}, "refine.window = 97: the images have 128 x 96 pixels.*at most 95"),
         ({"size": (97, 99)}, {"refine_window": 99}, "the images have 99 x 97 pixels.*at most 97"),
         ({}, {"thin": 5}, "refine.thin = 5 leaves 7 samples across a window of 33 px, 9 are needed: choose --thin 4"),
+        ({}, {"refine_frames": (3, 4)}, "refine.frames = 3,4: the model looks at 4 frames before and 4 behind already"),
+        (
+            {},
+            {"refine_frames": 5, "model": "affine-4d", "refine": 3},
+            "from 5 frames before to 5 behind, so frames 5:4",
+        ),
+        (
+            {},
+            {"refine_frames": "1,2,3"},
+            "refine.frames = '1,2,3' .option.: must be frames before and behind, N or A,B",
+        ),
+        ({"frames": 1}, {"refine_frames": 1, "refine": 3}, "refine.frames: model 'depth' is static: leave it out"),
+        ({}, {"model": "range-flow", "refine": 3, "refine_frames": 4}, "model 'range-flow' is refined with the frames"),
     ],
 )
 def test_refusals_name_value_limit_and_way_out(of: dict[str, Any], options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         plan(capture(**of), **options)
     assert "\n" not in str(caught.value)
+
+
+def test_frames_beside_those_of_the_model() -> None:
+    """They stand around the reference frame, and shorten the sequence that can be measured, as a window does."""
+    few = {"taps_time": "3", "size_time": 1, "model": "affine-4d", "refine": 3}
+    own, more = plan(**few), plan(refine_frames="2,3", **few)
+    assert (own.around, own.frames) == ((1, 1), tuple(range(1, 8)))
+    assert (more.around, more.frames) == ((2, 3), tuple(range(2, 6)))
+    assert more.refine is not None
+    assert more.refine.frames == (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
+    assert more.bytes > own.bytes
+    between = refined(refine_frames=(1, 2), **{**few, "taps_time": "2"})
+    assert between.frames == (-1.5, -0.5, 0.5, 1.5)
+    assert plan(refine_frames=3, **{**few, "refine": 0}).around == (1, 1)
 
 
 def test_the_largest_thinning_is_allowed() -> None:

@@ -37,8 +37,11 @@ class Layout:
     info: ImageInfo
 
 
-def find_layout(images: Images, root: Path) -> Layout:
-    """Find and check all images of a description whose paths are relative to ``root``; headers only."""
+def find_layout(images: Images, root: Path, gaps: bool = False) -> Layout:
+    """Find and check all images of a description whose paths are relative to ``root``; headers only.
+
+    ``gaps``: whether numbers of frames may be left out, as where each frame has a time of its own.
+    """
     pattern = images.file_pattern
     everything = list(pattern.discover(root))
     found = [(fields, path) for fields, path in everything if _selected(fields, images.select)]
@@ -46,7 +49,7 @@ def find_layout(images: Images, root: Path) -> Layout:
         raise InputError(f"no file fits {root / pattern.text}: check the pattern, its padding ({{t:03d}}), and select")
     first_index = min((fields["i"] for fields, _ in found if "i" in fields), default=0)
     files = _by_value(found, images, first_index)
-    values = _axis_values(files, pattern, images)
+    values = _axis_values(files, pattern, images, gaps)
     keys = list(itertools.product(*(values[axis] for axis in AXES)))
     missing = [key for key in keys if key not in files]
     if missing:
@@ -101,13 +104,16 @@ def _unfold(index: int, images: Images, path: Path) -> dict[str, int]:
     return dict(zip(images.index_axes, (int(k) for k in np.unravel_index(index, sizes)), strict=True))
 
 
-def _axis_values(files: Iterable[_Key], pattern: Pattern, images: Images) -> dict[str, tuple[int, ...]]:
-    """Values that each axis should have: evenly spaced between the first and the last found, or as selected."""
+def _axis_values(files: Iterable[_Key], pattern: Pattern, images: Images, gaps: bool) -> dict[str, tuple[int, ...]]:
+    """Values that each axis should have: evenly spaced between the first and the last found, or as selected; with
+    ``gaps`` frames are those that are found."""
     result = {}
     for k, axis in enumerate(AXES):
         found = sorted({key[k] for key in files})
         if axis in images.index_axes:
             result[axis] = tuple(range(images.shape[axis]))
+        elif axis == "t" and gaps:
+            result[axis] = tuple(found)
         elif axis in images.select:
             result[axis] = tuple(_select_range(images.select[axis]))
         elif axis in pattern.fields and len(found) > 1:

@@ -96,23 +96,26 @@ def _largest_deviation(capture: FileCapture) -> dict[str, Any]:
 
 
 def _working_distance(capture: FileCapture) -> dict[str, Any]:
-    """Preshift found in the images, and the depths [mm] that it and one pixel more or less of disparity mean.
+    """Preshift found in the images, whether it serves all they show, and the depths [mm] that it and one pixel more or
+    less of disparity mean.
 
     Z = -f b / nu (Schuchert 2010, Eq. (6.13)), along the axis with the larger baseline.
     """
-    from leafflow_ti.capture import find_preshift
+    from leafflow_ti.capture import UnclearDisparity, find_preshift, one_preshift_serves
 
     assert capture.geometry is not None
     try:
         preshift = find_preshift(capture)
     except InputError as error:
-        return {"preshift_px": None, "reason": str(error)}
+        searched = isinstance(error, UnclearDisparity)
+        return {"preshift_px": None, "reason": str(error), "searched": searched}
     baselines = capture.geometry.baseline_mm
     axis = 0 if abs(baselines[0]) >= abs(baselines[1]) else 1
     lever = capture.geometry.f_px * abs(baselines[axis])
     total = abs(preshift[axis] + capture.geometry.disparity_offset_px[axis])
     return {
         "preshift_px": list(preshift),
+        "serves_all": one_preshift_serves(capture, preshift, capture.n_frames > 1),
         "depth_mm": lever / total if total else None,
         "depth_one_pixel_nearer_mm": lever / (total + 1),
         "depth_one_pixel_farther_mm": lever / (total - 1) if total > 1 else None,
@@ -156,7 +159,8 @@ def _capture_lines(facts: dict[str, Any]) -> list[str]:
             f"offset       {_pair(geometry['disparity_offset_px'])} px of disparity per step, added to what is seen"
         )
     if distance is not None and distance["preshift_px"] is None:
-        lines.append(f"distance     unknown: {distance['reason']}")
+        instead = "; left out (--preshift auto), every frame is searched pixel by pixel" if distance["searched"] else ""
+        lines.append(f"distance     unknown: {distance['reason']}{instead}")
     elif distance is not None:
         lines.append(f"preshift     {_pair(distance['preshift_px'])} px per step, found in the images")
         farther = distance["depth_one_pixel_farther_mm"]
@@ -164,6 +168,11 @@ def _capture_lines(facts: dict[str, Any]) -> list[str]:
             lines.append(
                 f"depth        {distance['depth_mm']:.5g} mm at this preshift; "
                 f"1 px of disparity is {distance['mm_per_px']:.4g} mm"
+            )
+        if not distance["serves_all"]:
+            lines.append(
+                "             it does not fit all that the images show, or motions exceed a pixel: --preshift auto "
+                "searches every frame"
             )
         lines.append(
             f"depth range  {distance['depth_one_pixel_nearer_mm']:.5g} mm to "

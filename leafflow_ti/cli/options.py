@@ -110,6 +110,14 @@ Thin = Annotated[
         "The refinement takes every PIXELS-th pixel [auto: a 21st of it, 2 at most for one camera; accurate: 1].",
     ),
 ]
+RefineFrames = Annotated[
+    str | None,
+    _text(
+        "refine-frames",
+        "auto|N|BEFORE,BEHIND",
+        "Frames around the reference frame that the refinement takes [auto: those of the model].",
+    ),
+]
 Taps = Annotated[str | None, _text("taps", "3x1x1|3|5|7", "Derivative filters [5].")]
 Blur = Annotated[float | None, _text("blur", "PX", "Gaussian that widens the filters along x, y: for fast motion [0].")]
 BlurTime = Annotated[
@@ -153,8 +161,8 @@ SETTINGS: dict[str, Any] = {
     "brightness": Brightness, "brightness_terms": BrightnessTerms, "constraint": Constraint, "beta": Beta,
     "depth": Depth, "estimator": Estimator, "scale": Scale, "penalty": Penalty, "robust": Robust, "solver": Solver,
     "weighting": Weighting, "noise": Noise, "window": Window, "sigma": Sigma, "stride": Stride, "border": Border,
-    "refine": Refine, "refine_window": RefineWindow, "thin": Thin, "taps": Taps, "blur": Blur,
-    "blur_time": BlurTime, "prefilter": Prefilter,
+    "refine": Refine, "refine_window": RefineWindow, "thin": Thin, "refine_frames": RefineFrames, "taps": Taps,
+    "blur": Blur, "blur_time": BlurTime, "prefilter": Prefilter,
     "sigma_pre": SigmaPre, "frames": Frames, "roi": Roi, "mask": Mask, "preshift": Preshift,
     "disparity_range": DisparityRange, "motion_range": MotionRange,
     "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads,

@@ -15,7 +15,7 @@ from leafflow_ti.errors import UsageError
 from leafflow_ti.trace import BACKGROUND_STAGES, STAGES
 
 if TYPE_CHECKING:
-    from leafflow_ti.profiling import Profile, StageCost
+    from leafflow_ti.profile_report import Profile, StageCost
 
 
 @options.with_settings(without=("frames",))
@@ -71,19 +71,23 @@ def format_profile(found: Profile) -> list[str]:
     """The stages as a table, then the whole."""
     ceilings, whole = found.ceilings, found.prediction
     peak = "" if found.peak_bytes is None else f", peak of the process {found.peak_bytes / 2**20:.0f} MiB"
+    unit, before = "unit", f"after {found.fill_seconds:.2f} s to fill the windows"
+    parts = "for every band: filling the windows + frames x unit, by rows"
+    if found.searched:
+        unit, before = "frame", "each searched for what its pixels need"
+        parts = "frames x frame; others may show more surfaces, or fewer"
     overlap = "" if found.overlap is None else f", {found.overlap:.0%} of it hidden behind the computing"
     return [
         f"model       {found.model}",
         f"device      {found.device}; compiling or loading the kernels: {found.compile_seconds:.1f} s",
         f"ceilings    {ceilings.gflops_f32:.0f} GFLOP/s f32, {ceilings.gflops_f64:.0f} GFLOP/s f64, "
         f"{ceilings.gbytes:.1f} GB/s from memory",
-        f"measured    {found.frames_measured} units of {found.unit[0]} x {found.unit[1]} pixels, "
-        f"after {found.fill_seconds:.2f} s to fill the windows",
+        f"measured    {found.frames_measured} {unit}s of {found.unit[0]} x {found.unit[1]} pixels, {before}",
         "",
-        f"{'stage':<10} {'ms/unit':>9} {'us/px':>8} {'of time':>8} {'flops/px':>9} {'GFLOP/s':>8} {'of peak':>8} "
+        f"{'stage':<10} {f'ms/{unit}':>9} {'us/px':>8} {'of time':>8} {'flops/px':>9} {'GFLOP/s':>8} {'of peak':>8} "
         f"{'GB/s':>7} {'of peak':>8}  limit",
         *(_row(cost) for cost in found.stages),
-        f"{'unit':<10} {1e3 * found.seconds_per_unit:9.1f} "
+        f"{unit:<10} {1e3 * found.seconds_per_unit:9.1f} "
         f"{1e6 / found.pixels_per_second:8.3f} {1:8.0%}{'':46}  {found.limit}",
         "",
         *(f"{c.stage:<10} {STAGES[c.stage]}" for c in found.stages),
@@ -94,7 +98,7 @@ def format_profile(found: Profile) -> list[str]:
         f"memory      {found.planned_bytes / 2**20:.0f} MiB planned{peak}",
         f"whole       {whole.units} units ({whole.frames} frames x {whole.bands} bands, {whole.frames_read} frames "
         f"read): about {format_duration(whole.seconds)}",
-        "            = compiling + for every band: filling the windows + frames x unit, by rows",
+        f"            = compiling + {parts}",
     ]
 
 
