@@ -16,11 +16,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.aim import Aim
 from leafflow_ti.capture import Capture
 from leafflow_ti.field import empty_map
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.reading import Mask
-from leafflow_ti.refinement import Place, refine_beyond, refine_maps, refined_from, ring
+from leafflow_ti.refinement import Place, refine_maps, refined_from
 from leafflow_ti.search import Extent, coarse_search
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.status import HAS_VALUE, Status
@@ -239,54 +240,63 @@ class Adaptive:
     def _refine(
         self, tiles: list[_Tile], surfaces: Surfaces, frame: int, maps: Maps, codes: Codes, chosen: NDArray[np.int64]
     ) -> None:
-        """Refine a band's pixels, then those that no pass had values for, from tile to tile as far as they lead."""
-        refine = self.plan.refine
-        assert refine is not None
+        """Refine a band's pixels; those that no pass has values for from what the search found around them."""
         for tile in tiles:
+            there = np.ix_(tile.y, tile.x)
+            status, wanted = codes[tile.place], surfaces.known[there] & np.isin(codes[tile.place], BEYOND)
             for group in tile.groups(surfaces):
-                mine = np.isin(chosen[tile.place], group)
-                if (mine & (codes[tile.place] == Status.OK)).any():
-                    self._refine_group(tile, surfaces, group, frame, maps, codes, mine, False)
-        missing = np.zeros(codes.shape, np.bool_)
-        for tile in tiles:
-            missing[tile.place] = surfaces.known[np.ix_(tile.y, tile.x)]
-        missing &= np.isin(codes, BEYOND)
-        before = -1
-        while before != (before := int(np.count_nonzero(missing))):
-            for tile in tiles:
-                number = surfaces.number[np.ix_(tile.y, tile.x)]
-                for group in tile.groups(surfaces):
-                    wanted = np.isin(number, group) & missing[tile.place]
-                    joined = _joined(surfaces.shown[np.ix_(range(4), tile.y, tile.x)])
-                    known = refined_from(refine, {n: m[tile.place] for n, m in maps.items()}, codes[tile.place])
-                    if ring(wanted, known, joined)[0].size:
-                        self._refine_group(tile, surfaces, group, frame, maps, codes, wanted, True)
-                        missing[tile.place] &= ~(wanted & np.isin(codes[tile.place], HAS_VALUE))
+                mine = np.isin(chosen[tile.place], group) & (status == Status.OK)
+                begun = np.isin(surfaces.number[there], group) & wanted
+                if mine.any() or begun.any():
+                    self._refine_group(tile, surfaces, group, frame, maps, codes, mine, begun)
 
     def _refine_group(
         self, tile: _Tile, surfaces: Surfaces, group: list[int], frame: int, maps: Maps, codes: Codes, mine: Mask,
-        beyond: bool,
+        begun: Mask,
     ) -> None:  # fmt: skip
-        """Refine the pixels ``mine`` of a tile with the images that a group of labels aims at, in place. ``beyond``:
-        pixels without values, from their neighbours."""
-        plan = self.plan
+        """Refine the pixels ``mine`` and ``begun`` of a tile with the images that a group of labels aims at, in place.
+
+        ``begun`` have no values yet: they keep none where the refinement does not converge. The model needs every
+        camera and frame to see a pixel; the refinement takes the images that do.
+        """
+        plan, aims = self.plan, [surfaces.aims[label] for label in group]
         stay = self._stay(tile, surfaces, group, frame)
         self._feed(stay, plan.around, partial(self.common.stays.refine_alone, stay))
         assert stay.engine.refine is not None
         assert plan.refine is not None
         part = {name: values[tile.place].copy() for name, values in maps.items()}
+        status = np.where(mine | begun, np.uint8(Status.OK), np.uint8(Status.NOT_COMPUTED))
+        if begun.any():
+            start = coarse_start(surfaces, aims, (tile.y, tile.x), plan)
+            for name in part.keys() & start.keys():
+                part[name][begun] = start[name][begun]
+            status[begun & ~refined_from(plan.refine, part, status)] = Status.NOT_COMPUTED
         place = Place(tile.y, tile.x, (stay.wide.y, stay.wide.x), plan.geometry)
-        status = codes[tile.place].copy()
-        if beyond:
-            joined = _joined(surfaces.shown[np.ix_(range(4), tile.y, tile.x)])
-            effort = refine_beyond(stay.engine.refine, plan.refine, part, status, place, mine, joined)
-        else:
-            status[~mine] = Status.NOT_COMPUTED
-            effort = refine_maps(stay.engine.refine, plan.refine, part, status, place)
-        self.common.effort += effort
-        codes[tile.place][mine] = status[mine]
+        self.common.effort += refine_maps(stay.engine.refine, plan.refine, part, status, place)
+        found = mine | (begun & (status == Status.OK))
+        codes[tile.place][found] = status[found]
         for name, values in part.items():
-            maps[name][tile.place][mine] = values[mine]
+            maps[name][tile.place][found] = values[found]
+
+
+def coarse_start(surfaces: Surfaces, aims: Sequence[Aim], at: tuple[range, range], plan: Plan) -> Maps:
+    """What the surface of some labels looks like around the pixels at rows and columns ``at``, as the refinement can
+    start from it: the plane and the motion that fit the search's values within its window. NaN where there are none."""
+    refine, geometry, axis = plan.refine, plan.geometry, surfaces.axis
+    assert refine is not None
+    fitted, along_x, along_y = surfaces.planes(aims, at, refine.size // 2)
+    if refine.flat:
+        return {"flow_x": fitted[2], "flow_y": fitted[3]}
+    f, disparity = geometry.f_px, fitted[axis] + geometry.disparity_offset_px[axis]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -f * geometry.baseline_mm[axis] / disparity
+        # Disparities of a plane are linear: d ~ 1 - ZX x/f - ZY y/f.
+        tilt_x, tilt_y = (f * slope[axis] / disparity for slope in (along_x, along_y))
+    ray_y, ray_x = ((np.array(n) - c) / f for n, c in zip(at, geometry.principal_px[::-1], strict=True))
+    slant = 1.0 / (1.0 - tilt_x * ray_x - tilt_y * ray_y[:, None])
+    depth[~(np.isfinite(depth) & (depth > 0.0) & (slant > 0.0))] = np.nan
+    start = {"depth": depth, "disparity": disparity, "slope_x": -tilt_x * slant, "slope_y": -tilt_y * slant}
+    return start | {f"velocity_{name}": fitted[2 + k] * depth / f for k, name in enumerate("xy")}
 
 
 def extent_of(plan: Plan, capture: Capture) -> Extent:

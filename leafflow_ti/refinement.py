@@ -77,57 +77,6 @@ def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArra
     return effort
 
 
-def refine_beyond(
-    stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place,
-    wanted: NDArray[np.bool_], joined: tuple[NDArray[np.bool_], NDArray[np.bool_]],
-) -> Effort:  # fmt: skip
-    """Refine the pixels ``wanted`` that the model has no values for, in place: ring by ring from their refined
-    neighbours, whose plane and motion they start from. Returns what it took.
-
-    The model needs every camera and frame to see a pixel; the refinement takes the images that do. ``joined``: which
-    pixels lie on one surface with the one below, and to the right.
-    """
-    effort, wanted = Effort(), wanted.copy()
-    while True:
-        known = refined_from(plan, maps, status)
-        rows, cols, from_rows, from_cols = ring(wanted, known, joined)
-        if not rows.size:
-            return effort
-        wanted[rows, cols] = False
-        sources = {name: maps[name][from_rows, from_cols] for name in starting(plan) if name in maps}
-        rays = [place.rays(*at) / (1.0 if plan.flat else place.geometry.f_px)
-                for at in ((from_rows, from_cols), (rows, cols))]  # fmt: skip
-        start = transferred(_starts(plan, sources, rows.size), *rays)
-        found = _call(stage, place, rows, cols, start)
-        effort += found.effort
-        good = found.converged
-        lever = None
-        if "disparity" in maps:
-            lever = (maps["disparity"][from_rows, from_cols].astype(float) * maps["depth"][from_rows, from_cols])[good]
-        rows, cols = rows[good], cols[good]
-        _enter(plan, maps, place, rows, cols, found.parameters[good], found.covariance[good], lever)
-        status[rows, cols] = Status.OK
-
-
-def ring(
-    wanted: NDArray[np.bool_], known: NDArray[np.bool_], joined: tuple[NDArray[np.bool_], NDArray[np.bool_]]
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of wanted pixels beside known ones of their surface; and of one of these for each."""
-    down, across = joined
-    source = np.full((2, *wanted.shape), -1)
-    place = np.indices(wanted.shape)
-    for axis, pairs in enumerate((down, across)):
-        ends: list[tuple[slice, ...]] = [
-            tuple(part if a == axis else slice(None) for a in (0, 1)) for part in (slice(None, -1), slice(1, None))
-        ]
-        for to, back in (ends, ends[::-1]):
-            take = wanted[to] & known[back] & pairs & (source[0][to] < 0)
-            for k in range(2):
-                source[k][to][take] = place[k][back][take]
-    rows, cols = np.nonzero(source[0] >= 0)
-    return rows, cols, source[0][rows, cols], source[1][rows, cols]
-
-
 def _enter(
     plan: Refinement, maps: Maps, place: Place, rows: Array, cols: Array, parameters: Array, covariance: Array,
     lever: Array | None,

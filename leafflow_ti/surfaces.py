@@ -19,6 +19,7 @@ from leafflow_ti.aim import Aim
 from leafflow_ti.reading import Box, Mask
 from leafflow_ti.runtime import Device
 from leafflow_ti.search import Coarse, Extent
+from leafflow_ti.stages.search import box_mean
 
 Floats = NDArray[np.float32]
 
@@ -81,6 +82,36 @@ class Surfaces:
         other = other | ~np.logical_or.reduce(within)
         out[inner] = ~dilated(other, 1)
         return out[1:-1, 1:-1]
+
+    def planes(self, aims: Sequence[Aim], at: tuple[range, range], radius: int) -> tuple[Floats, Floats, Floats]:
+        """Values, and slopes along x and y, [4, rows, cols] each, of the planes through what the surface of some labels
+        shows within ``radius`` px of the pixels at rows and columns ``at``; NaN where there is nothing of it."""
+        rows, cols = (slice(max(0, n[0] - radius), n[-1] + radius + 1) for n in at)
+        shown, belongs = self.shown[:, rows, cols].astype(float), self.known[rows, cols]
+        belongs = belongs & np.logical_or.reduce(
+            [np.abs(shown - vector(aim)[:, None, None]).max(axis=0) <= REACH for aim in aims]
+        )
+        here = np.ix_(np.array(at[0]) - rows.start, np.array(at[1]) - cols.start)
+        y, x = (np.arange(n, dtype=float) - (n - 1) / 2 for n in belongs.shape)
+        x, y = np.broadcast_arrays(x, y[:, None])
+
+        def mean(values: NDArray[Any]) -> NDArray[np.float64]:
+            return np.asarray(box_mean(values * belongs, radius)[here] / share)
+
+        share = box_mean(belongs, radius)[here]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mx, my = mean(x), mean(y)
+            # A pixel's own width keeps slopes finite where a single row or column is left.
+            xx, yy, xy = mean(x * x) - mx * mx + 1 / 12, mean(y * y) - my * my + 1 / 12, mean(x * y) - mx * my
+            found = []
+            for values in shown:
+                m = mean(values)
+                vx, vy = mean(values * x) - m * mx, mean(values * y) - m * my
+                det = xx * yy - xy * xy
+                slope_x, slope_y = (yy * vx - xy * vy) / det, (xx * vy - xy * vx) / det
+                found.append((m + slope_x * (x[here] - mx) + slope_y * (y[here] - my), slope_x, slope_y))
+        value, along_x, along_y = (np.array(part, np.float32) for part in zip(*found, strict=True))
+        return value, along_x, along_y
 
     def hidden(self, aim: Aim, elapsed: float, box: Box) -> Mask | None:
         """Where another surface hides a label's, ``elapsed`` frames from the results: [sy, sx, rows, cols], or None.
