@@ -25,6 +25,7 @@ from refine_bench import SCENE, Case, covariance, estimated
 from test_kernels_estimate import assert_maps_equal
 from test_prefilter import assert_equals_twin
 from test_search import assert_search_equals_twin
+from test_surfaces import assert_hidden_equals_naive
 from tolerances import SOLVERS, tolerance
 
 from leafflow_ti.stages.estimators import ESTIMATORS
@@ -63,7 +64,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 9} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 10} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -161,6 +162,10 @@ def on_vulkan_the_refinement_equals_the_twin(device: Callable) -> None:
     assert holed[0].converged.all()
     np.testing.assert_array_equal(holed[0].parameters, holed[1].parameters)
     assert (holed[0].parameters != found.parameters).any()
+
+
+def on_vulkan_what_is_hidden_equals_naive_loops(device: Callable) -> None:
+    assert_hidden_equals_naive(device, (3, 5))
 
 
 def on_vulkan_the_search_equals_its_twin(device: Callable) -> None:
