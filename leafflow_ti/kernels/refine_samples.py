@@ -18,6 +18,7 @@ from leafflow_ti.kernels.refine_tables import (
     FUNCTIONS,
     NOTHING,
     SHIFTS,
+    SHOWN,
     Scalar,
     Size,
     Value,
@@ -29,9 +30,6 @@ from leafflow_ti.kernels.spec import KernelSpec
 NO_WRAP = ADDRESSED - 1
 """An index that is known to be positive and small needs no extension of its own
 for each neighbour: measured, three quarters of the time of an interpolation."""
-
-MOST_IMAGES = 0.8
-"""Share of the images that must show a sample where light is fitted."""
 
 
 @functools.cache
@@ -211,15 +209,11 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
         some = ti.select(mass > V(1e-6), V(1.0), V(0.0))
         scale = some / ti.max(mass, V(1e-6))
         if not limit > 0.0:
-            # What no image shows is no part of the window; nor, where light is fitted, what many do not: its terms
-            # would be fitted to different parts of the window in different images.
-            enough = some
-            if terms > 0:
-                most = ti.cast(size[Size.IMAGES], real) * ti.cast(MOST_IMAGES, real)
-                enough = ti.select(mass > V(most), V(1.0), V(0.0))
-            S[slot.real + size[Size.WEIGHT] + group] = S[slot.real + size[Size.WEIGHT] + group] * enough
+            # What no image shows is no part of the window.
+            S[slot.real + size[Size.WEIGHT] + group] = S[slot.real + size[Size.WEIGHT] + group] * some
         old = slot.real + size[Size.SCRATCH] + group
         S[old], S[old + groups], S[old + 2 * groups] = bxx, bxy, byy
+        S[old + SHOWN * groups] = mass
         to = slot.real + size[Size.FUNCTION] + group
         if fresh:
             tx, ty = tx * scale, ty * scale

@@ -10,6 +10,7 @@ from leafflow_ti.kernels.refine_tables import (
     GROWTH,
     MAX_UNKNOWNS,
     SHIFTS,
+    SHOWN,
     TERMS,
     Code,
     Image,
@@ -34,6 +35,8 @@ TOLERATED = 0.03
 """Pixels of misplacement whose residual is no reason to trust an image or a sample less."""
 TUKEY = 6.0
 """Standard deviations beyond which a sample has no weight."""
+MOST_IMAGES, LEVELS = 0.8, 8
+"""Share of the images that show a sample of a window where light is fitted, at most; and how many shares are tried."""
 WHOLE = 0.97
 """Share of the window that an image must show to take part where light is fitted."""
 CONVERGED = 0.01
@@ -304,11 +307,30 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
             p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT] = precise(1.0), precise(0.0)
 
     @ti.func
+    def agree(slot: ti.template(), size: ti.template(), r: ti.template()):
+        """Leave samples out that fewer images show than others: light would be fitted to different parts of the window
+        in different images. Which are left out is chosen so that most is kept, samples times images."""
+        first = (slot.real + size[Size.WEIGHT]) * lanes
+        shown = (slot.real + size[Size.SCRATCH] + SHOWN * size[Size.SAMPLE_GROUPS]) * lanes
+        best, least = ti.cast(0.0, spec.real), ti.cast(0.0, spec.real)
+        for n in range(LEVELS):
+            images = ti.cast(size[Size.IMAGES] * (LEVELS - n), spec.real) * ti.cast(MOST_IMAGES / LEVELS, spec.real)
+            kept = ti.cast(0.0, spec.real)
+            for i in range(size[Size.SAMPLES]):
+                kept += ti.select(r[shown + i] > images, r[first + i], ti.cast(0.0, spec.real))
+            if images * kept > best:
+                best, least = images * kept, images
+        for i in range(size[Size.SAMPLES]):
+            r[first + i] = ti.select(r[shown + i] > least, r[first + i], ti.cast(0.0, spec.real))
+
+    @ti.func
     def masses(slot: ti.template(), size: ti.template(), r: ti.template(), p: ti.template()):
         """In the first pass: weight of the window, and how many samples of equal weight it stands for."""
         s = scalars(slot, size)
         if p[s + Scalar.PASSES] < 0.5:
             first = (slot.real + size[Size.WEIGHT]) * lanes
+            if size[Size.TERMS] > 0:
+                agree(slot, size, r)
             one, two = precise(0.0), precise(0.0)
             for i in range(size[Size.SAMPLES]):
                 w = ti.cast(r[first + i], precise)

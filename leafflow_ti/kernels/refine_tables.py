@@ -184,6 +184,8 @@ class Out(IntEnum):
     N = COVARIANCE + MAX_UNKNOWNS * MAX_UNKNOWNS
 
 
+SHOWN = 3
+"""Plane of SCRATCH, behind those of the texture's blur: how many images show a sample."""
 ADDRESSED = 1 << 30
 """Coefficients that a pixel can be sampled from: their indices are cut to so many."""
 NOTHING = 1e30
