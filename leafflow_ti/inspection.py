@@ -119,6 +119,7 @@ class _Check:
         row0, col0 = capture.reference
         steps = np.array([(col - col0, row - row0) for row, col in self.cameras], float)
         nominal, offset = steps * np.array(geometry.baseline_mm), steps * np.array(geometry.disparity_offset_px)
+        stated = nominal if capture.positions_mm is None else capture.positions_mm.reshape(-1, 2)
         axis = 0 if capture.n_cols > 1 else 1
         seen = coarse.disparity[points[:, 0], points[:, 1]].astype(float)
         q = -(seen + geometry.disparity_offset_px[axis]) / geometry.baseline_mm[axis]
@@ -131,17 +132,17 @@ class _Check:
             if k == reference:
                 continue
             found = templates.find(
-                np.asarray(self.image(self.frame, *self.cameras[k]), np.float64), -q[:, None] * nominal[k] - offset[k]
+                np.asarray(self.image(self.frame, *self.cameras[k]), np.float64), -q[:, None] * stated[k] - offset[k]
             )
             places[k], ok[k] = found.shift + offset[k], found.ok
             # The nearer cameras say where the next ones will show the point.
-            lever = np.sum(ok[..., None] * nominal[:, None] ** 2, axis=(0, 2))
-            better = -np.einsum("kn,knj,kj->n", ok, places, nominal) / np.maximum(lever, 1e-30)
+            lever = np.sum(ok[..., None] * stated[:, None] ** 2, axis=(0, 2))
+            better = -np.einsum("kn,knj,kj->n", ok, places, stated) / np.maximum(lever, 1e-30)
             q = np.where(lever > 0, better, q)
             if found.ok.sum() > 2:
                 gains[k] = _gain(found.gain[found.ok], found.grey[found.ok], templates.grey[found.ok])
         principal = np.array(geometry.principal_px)
-        return fit_positions(places, ok, points[:, ::-1] - principal, nominal, reference), gains
+        return fit_positions(places, ok, points[:, ::-1] - principal, nominal, reference, stated), gains
 
     def _camera(self, k: int, places: Positions | None, gains: dict[int, tuple[float, float, float]]) -> CameraCheck:
         row, col = self.cameras[k]

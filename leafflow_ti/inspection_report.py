@@ -19,9 +19,9 @@ class Advice:
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """One camera of the grid: ``row``, ``col``; ``off_um`` and its error [µm] from the even grid, (x, y), None where it
-    cannot be told; ``roll_mrad`` against the reference; ``gain`` and ``offset`` of its grey values against those of the
-    reference; ``noise`` and share of ``saturated`` pixels."""
+    """One camera of the grid: ``row``, ``col``; ``off_um`` and its error [µm] from where it is said to stand, (x, y),
+    None where it cannot be told; ``roll_mrad`` against the reference; ``gain`` and ``offset`` of its grey values
+    against those of the reference; ``noise`` and share of ``saturated`` pixels."""
 
     row: int
     col: int

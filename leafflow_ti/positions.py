@@ -30,9 +30,9 @@ _MAD = 1.4826
 class Positions:
     """Of the cameras in the order given; those that share too few points are NaN.
 
-    ``measured_mm`` [K, 2]: in the scale of the nominal ones. ``off_mm`` [K, 2]: their distance from the even grid, once
-    a turn and unequal scales of the whole grid are taken out, with its standard error ``error_mm``. ``roll`` [K] rad
-    against the reference, with ``roll_error``. ``linear`` [2, 2]: the grid's axes as measured, per nominal one, with
+    ``measured_mm`` [K, 2]: in the scale of the stated ones. ``off_mm`` [K, 2]: their distance from these, once a turn
+    and unequal scales of the whole grid are taken out, with its standard error ``error_mm``. ``roll`` [K] rad against
+    the reference, with ``roll_error``. ``linear`` [2, 2]: the grid's axes as measured, per stated one, with
     ``linear_error`` of its elements. ``px_per_mm``: of the points in the middle of the depth range; ``residual_px``:
     scatter of single places; ``seen`` [K]: points.
     """
@@ -49,11 +49,13 @@ class Positions:
     seen: NDArray[np.intp]
 
 
-def fit_positions(places: Floats, ok: Mask, points: Floats, nominal_mm: Floats, reference: int) -> Positions | None:
+def fit_positions(
+    places: Floats, ok: Mask, points: Floats, nominal_mm: Floats, reference: int, stated_mm: Floats | None = None
+) -> Positions | None:
     """Positions from the total displacements ``places`` [K, n, 2] px of points against the reference camera.
 
-    ``ok`` [K, n]; ``points`` [n, 2] px from the principal point; ``nominal_mm`` [K, 2]. None: too few points, or
-    cameras.
+    ``ok`` [K, n]; ``points`` [n, 2] px from the principal point; ``nominal_mm`` [K, 2] of an even grid; ``stated_mm``
+    [K, 2]: where the cameras are said to stand, if not there. None: too few points, or cameras.
     """
     enough = ok.sum(axis=1) >= LEAST_POINTS
     used = ok & enough[:, None]
@@ -62,7 +64,8 @@ def fit_positions(places: Floats, ok: Mask, points: Floats, nominal_mm: Floats, 
         return None
     places, points, weights = places[:, shared], points[shared], used[:, shared].astype(float)
     turned = np.stack([-points[:, 1], points[:, 0]], axis=-1)
-    s, roll, scale = nominal_mm.copy(), np.zeros(len(nominal_mm)), 0.0
+    stated_mm = nominal_mm if stated_mm is None else stated_mm
+    s, roll, scale = stated_mm.copy(), np.zeros(len(nominal_mm)), 0.0
     given = weights
     for _ in range(ROUNDS):
         rest = places - roll[:, None, None] * turned
@@ -73,14 +76,14 @@ def fit_positions(places: Floats, ok: Mask, points: Floats, nominal_mm: Floats, 
         size = np.sqrt(np.sum(residual**2, axis=-1) / 2)
         scale = float(_MAD * np.sqrt(0.72) * np.median(size[given > 0])) or 1e-12  # a pair's size is larger: Rayleigh
         weights = given * np.clip(1 - (size / (CUT * scale)) ** 2, 0, None) ** 2
-        s = _regauged(s, nominal_mm, enough, reference)
+        s = _regauged(s, stated_mm, enough, reference)
     # Each point spends three of its numbers on its own place and depth.
     counted = float(weights.sum())
     spent = (3 * shared.sum() + 3 * enough.sum()) / max(2 * counted, 1.0)
     variance = float(np.sum(weights[..., None] * residual**2) / (2 * counted)) / max(1 - spent, 0.1)
     middle = float(np.median(q))
     error = np.sqrt(variance * np.einsum("kii->ki", covariance)[:, :2] + (FLOOR_PX / middle) ** 2)
-    linear, linear_error, off = _grid(s, nominal_mm, enough, error)
+    linear, linear_error, off = _grid(s, nominal_mm, stated_mm, enough, error)
     lost = ~enough
     for values in (s, off, error, roll):
         values[lost] = np.nan
@@ -125,17 +128,20 @@ def _regauged(s: Floats, nominal: Floats, enough: Mask, reference: int) -> Float
     return np.asarray(scale * s + np.array([x, y]))
 
 
-def _grid(s: Floats, nominal: Floats, enough: Mask, error: Floats) -> tuple[Floats, Floats, Floats]:
-    """The linear map [2, 2] from nominal to measured positions of most cameras, its errors, and what is left."""
+def _grid(s: Floats, nominal: Floats, stated: Floats, enough: Mask, error: Floats) -> tuple[Floats, Floats, Floats]:
+    """The linear map [2, 2] from stated to measured positions of most cameras, its errors, and what is left.
+
+    It is told along the axes of the nominal grid: measured positions across them differ by chance.
+    """
     varied = np.ptp(nominal[enough], axis=0) > 0
     columns = np.column_stack([np.ones(len(nominal)), nominal[:, varied]])
     linear: Floats = np.eye(2)
     errors, off = np.zeros((2, 2)), np.zeros_like(s)
     for k in range(2):
-        found, inverse = robust_solution(columns[enough], s[enough, k], float(np.median(error[enough, k])))
-        linear[k, varied] = found[1:]
+        found, inverse = robust_solution(columns[enough], (s - stated)[enough, k], float(np.median(error[enough, k])))
+        linear[k, varied] += found[1:]
         errors[k, varied] = np.sqrt(np.diag(inverse)[1:]) * float(np.median(error[enough, k]))
-        off[:, k] = s[:, k] - columns @ found
+        off[:, k] = (s - stated)[:, k] - columns @ found
     return linear, errors, off
 
 

@@ -61,6 +61,7 @@ CASES = (
     Case("speckle", "speckle:run", "one camera as a strain gauge: rendered plate, rigid series, noise floor by window"),
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
     Case("plan-rig", "plan_rig:run", "errors predicted for a camera rig against the scatter of simulated estimates"),
+    Case("rig-check", "rig_check:run", "a camera 10 µm off its place: found by check, depth without and with its line"),
     Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),
     Case("stages", "stages:run", "microseconds per output pixel and stage, share of the machine's ceilings; memory"),
     Case(

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from leafflow_ti.capture.channels import Array
 from leafflow_ti.capture.description import Description
 from leafflow_ti.capture.lens import Lens
-from leafflow_ti.capture.measured import LEAST_FRACTION, REACH, interpolated
+from leafflow_ti.capture.measured import FRACTION_DIGITS, LEAST_FRACTION, REACH, interpolated
 
 
 @dataclass(frozen=True)
@@ -215,27 +215,37 @@ class Capture(ABC):
                     yield partial(self._read_at, out[i, j, k], t, sy, sx, *place)
 
     def _read_at(self, out: Array, t: int, sy: int, sx: int, top: float, left: float) -> None:
-        """The same as ``_read_into`` at a place between pixels."""
+        """The same as ``_read_into`` at a place between pixels. Images are interpolated once: with a lens, where that
+        takes out its distortion."""
         corner = math.floor(top + LEAST_FRACTION), math.floor(left + LEAST_FRACTION)
-        fraction = top - corner[0], left - corner[1]
+        # Rounded: the same bits wherever a window begins.
+        fraction = round(top - corner[0], FRACTION_DIGITS), round(left - corner[1], FRACTION_DIGITS)
         if max(fraction) < LEAST_FRACTION:
             self._read_into(out, t, sy, sx, *corner)
+            return
+        if self.lenses is not None:
+            self._read_into(out, t, sy, sx, *corner, fraction)
             return
         around = np.zeros([n + 2 * REACH for n in out.shape], out.dtype)
         self._read_into(around, t, sy, sx, corner[0] - REACH, corner[1] - REACH)
         out[...] = interpolated(around, fraction)
 
-    def _read_into(self, out: Array, t: int, sy: int, sx: int, top: int, left: int) -> None:
-        """Copy the part of a window that lies inside the image; ``out`` is zero before."""
+    def _read_into(
+        self, out: Array, t: int, sy: int, sx: int, top: int, left: int, fraction: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Copy the part of a window that lies inside the image; ``out`` is zero before. With lenses it may begin
+        ``fraction`` (y, x) of a pixel behind its corner."""
         for name, index, count in (("frame", t, self.n_frames), ("row", sy, self.n_rows), ("column", sx, self.n_cols)):
             if not 0 <= index < count:
                 raise IndexError(f"{name} {index} does not exist: the capture has 0 to {count - 1}")
-        y0, y1 = max(top, 0), min(top + out.shape[0], self.height)
-        x0, x1 = max(left, 0), min(left + out.shape[1], self.width)
+        beyond_y, beyond_x = (int(part > 0) for part in fraction)  # the last pixel has no next one
+        y0, y1 = max(top, 0), min(top + out.shape[0], self.height - beyond_y)
+        x0, x1 = max(left, 0), min(left + out.shape[1], self.width - beyond_x)
         if y0 >= y1 or x0 >= x1:
             return
         inside = out[y0 - top : y1 - top, x0 - left : x1 - left]
         if self.lenses is None:
             inside[...] = self._window(t, sy, sx, y0, y1, x0, x1)
         else:
-            self.lenses[sy][sx].rectify(inside, y0, x0, (self.height, self.width), partial(self._window, t, sy, sx))
+            size, read = (self.height, self.width), partial(self._window, t, sy, sx)
+            self.lenses[sy][sx].rectify(inside, y0, x0, size, read, fraction)

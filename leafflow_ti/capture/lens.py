@@ -77,14 +77,18 @@ class Lens:
         back = np.flatnonzero(~(np.diff(seen) > 0))
         return float(r[back[0]]) if back.size else math.inf
 
-    def rectify(self, out: Array, top: int, left: int, size: tuple[int, int], read: ReadWindow) -> None:
-        """Fill ``out`` [rows, columns] with the rectified image from (``top``, ``left``); NaN where it was not seen.
+    def rectify(
+        self, out: Array, top: int, left: int, size: tuple[int, int], read: ReadWindow,
+        fraction: tuple[float, float] = (0.0, 0.0),
+    ) -> None:  # fmt: skip
+        """Fill ``out`` [rows, columns] with the rectified image from (``top``, ``left``), and ``fraction`` (y, x) of a
+        pixel behind it; NaN where it was not seen.
 
         ``size``: (height, width) of the stored image, of which ``read`` gives windows.
         """
         x, y = self.source(
-            np.arange(left, left + out.shape[1], dtype=np.float64),
-            np.arange(top, top + out.shape[0], dtype=np.float64)[:, None],
+            np.arange(left, left + out.shape[1], dtype=np.float64) + fraction[1],
+            np.arange(top, top + out.shape[0], dtype=np.float64)[:, None] + fraction[0],
         )
         seen = _within(x, size[1]) & _within(y, size[0])
         if not seen.any():

@@ -27,6 +27,8 @@ _BAND = 0.65 * np.pi
 """Frequency [rad/px] up to which it is exact (to 2e-4): what lies above, the derivative filters suppress."""
 LEAST_FRACTION = 1e-6
 """Fraction of a pixel below which nothing is interpolated."""
+FRACTION_DIGITS = 9
+"""Decimals of a fraction: its last bits depend on the whole pixels that it stands beside."""
 
 
 def camera_positions(

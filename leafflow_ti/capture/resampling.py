@@ -1,6 +1,10 @@
 """Images between their pixels, by quintic splines through the grey values, which are mirrored at the border.
 
 What a place gets depends on it and the image alone, not on the window that is asked for: sums run tap by tap.
+
+This is for places of any distribution. An image that is read at one and the same fraction of a pixel throughout goes
+through the longer filters of ``measured.interpolated``: they keep a texture of 4 px wavelength to 3e-6 of its contrast
+(splines 2.5e-3; of 6 px 7e-5 and 1.4e-4) at a tenth of the time.
 """
 
 from __future__ import annotations
@@ -38,13 +42,14 @@ def resample(read: ReadWindow, size: tuple[int, int], y: Floats, x: Floats, dtyp
     spans = tuple((math.floor(p.min()), math.floor(p.max()) + 1) for p in (y, x))
     found, unsure = _coefficients(read, size, spans, dtype)
     reach = support(DEGREE)
-    y, x = y - (spans[0][0] + 1 - reach), x - (spans[1][0] + 1 - reach)  # from the first coefficient
+    first = tuple(span[0] + 1 - reach for span in spans)  # where the first coefficient stands
     values = np.empty(y.size, found.dtype)
     flat = (y.reshape(-1), x.reshape(-1))
     for start in range(0, y.size, CHUNK):
         part = slice(start, start + CHUNK)
-        values[part] = _interpolate(found, flat[0][part], flat[1][part])
-    sure = np.ones(y.shape, bool) if unsure is None else ~unsure[np.rint(y).astype(np.intp), np.rint(x).astype(np.intp)]
+        values[part] = _interpolate(found, flat[0][part], flat[1][part], first)
+    nearest = (np.rint(p).astype(np.intp) - n for p, n in zip((y, x), first, strict=True))
+    sure = np.ones(y.shape, bool) if unsure is None else ~unsure[tuple(nearest)]
     return values.reshape(y.shape), sure
 
 
@@ -121,13 +126,16 @@ def _convolved(image: Array, taps: Floats, axis: int) -> Array:
     return total
 
 
-def _interpolate(coefficients: Array, y: Floats, x: Floats) -> Array:
-    """The spline at positions [n] counted from the first coefficient, ``support - 1`` or more of them inside."""
-    first = 1 - support(DEGREE)
+def _interpolate(coefficients: Array, y: Floats, x: Floats, first: tuple[int, ...]) -> Array:
+    """The spline at positions [n]; ``first``: row and column of the first coefficient, ``support - 1`` or more before
+    these."""
+    before = 1 - support(DEGREE)
+    # Fractions are those of the positions in the image, whatever part of it is at hand.
     whole_y, whole_x = np.floor(y), np.floor(x)
     wy, wx = (_weights(p, coefficients.dtype) for p in (y - whole_y, x - whole_x))
     width, flat = coefficients.shape[1], coefficients.reshape(-1)
-    at = (whole_y.astype(np.intp) + first) * width + whole_x.astype(np.intp) + first
+    row, col = (p.astype(np.intp) - n + before for p, n in zip((whole_y, whole_x), first, strict=True))
+    at = row * width + col
     total = np.zeros(len(x), coefficients.dtype)
     line, value = np.empty_like(total), np.empty_like(total)
     for j in range(DEGREE + 1):
