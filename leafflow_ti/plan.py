@@ -276,6 +276,11 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     motion = fitted_motion(config, name)
     preshift, ranges, noise, around = (0, 0), None, noise_level(capture, config), (0, 0)
     adaptive = False
+    if model.ranges and config.preshift == "adaptive":
+        raise ConfigError(
+            f"preshift 'adaptive': model '{name}' takes one preshift and no motion out: choose --preshift uniform, or "
+            "another model"
+        )
     if model.ranges:
         depth = None if config.range_flow.depth else model_problem(capture, static(config), "depth", None)
         own = replace(depth, noise=noise) if depth else None

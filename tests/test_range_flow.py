@@ -29,6 +29,7 @@ from leafflow_ti.filters import filter_set
 from leafflow_ti.metrics import aae, erode
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.noise import white_noise
+from leafflow_ti.plan import make_plan
 from leafflow_ti.progress import Progress
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import AxisSampling, Sampling
@@ -374,3 +375,9 @@ def test_cube_under_a_fixed_spot() -> None:
     assert np.mean(error[faces["right"]]) <= 0.056
     for kept in faces.values():
         assert abs(np.nanmean(field["growth_rate"][kept])) <= 0.02
+
+
+def test_range_flow_takes_one_preshift() -> None:
+    capture = capture_from_array(np.zeros((7, 1, 5, 60, 60)), Geometry(1000.0, (30.0, 30.0), (1.0, 0.0)))
+    with pytest.raises(ConfigError, match=r"preshift 'adaptive': model 'range-flow' takes one.*--preshift uniform"):
+        make_plan(capture, load_config(overrides={"model": "range-flow", "preshift": "adaptive"}))
