@@ -7,7 +7,7 @@ columns in the reference image (a stride above 1 leaves pixels out). Lengths are
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -176,6 +176,12 @@ class Field(Mapping[str, NDArray[np.float32]]):
     def shape(self) -> tuple[int, int]:
         """Rows and columns of every map."""
         return (self.y.size, self.x.size)
+
+    def measured(self) -> Field:
+        """The same without the values that a coarse search alone gives (status ``coarse``), which have no errors."""
+        coarse = self.status == Status.COARSE
+        maps = {name: np.where(coarse, empty_map(name, ()), values) for name, values in self.maps.items()}
+        return replace(self, maps=maps)
 
     def status_shares(self) -> dict[str, float]:
         """Share of the pixels [0..1] per status name; only those that occur."""

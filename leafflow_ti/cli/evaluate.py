@@ -44,7 +44,7 @@ def evaluate(
 
     Reports the average angular error (AAE) of velocity, rotation and acceleration, each as the angle between (v, 1)
     and its truth in mm/frame, rad/frame and mm/frame², errors of depth and slopes, and how well the standard errors
-    describe them: (estimate - truth)/std should have mean 0 and standard deviation 1. Labels of truth.npz (face,
+    describe them (the coarse search's values have none and are left out): (estimate - truth)/std should have mean 0 and standard deviation 1. Labels of truth.npz (face,
     region) are reported apart, each whole and without its border.
     """
     if margin is not None and margin < 0:
@@ -54,7 +54,7 @@ def evaluate(
 
     known = metrics.read_truth(truth)
     store = ResultStore.open(result)
-    field = store.field(_frame_index(store, known, frame, truth))
+    field = store.field(_frame_index(store, known, frame, truth)).measured()
     if margin is None:
         margin = window_size(store.attrs) // 2
     regions = {name: mask[field.y][:, field.x] for name, mask in metrics.label_regions(known, margin).items()}
