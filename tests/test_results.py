@@ -283,6 +283,15 @@ def test_field_is_a_mapping_of_its_maps() -> None:
         f["flow_x"]
 
 
+def test_measured_leaves_out_what_the_search_alone_gives() -> None:
+    f = field()
+    f.status[1, :2] = Status.COARSE
+    values = f.measured()["depth"]
+    assert np.isnan(values[1, :2]).all()
+    np.testing.assert_array_equal(values[1, 2:], f["depth"][1, 2:])
+    assert np.isfinite(f["depth"]).all()
+
+
 def test_field_checks_its_shapes_and_names() -> None:
     f = field()
     with pytest.raises(ValueError, match=r"status has the shape \(2, 4\)"):
