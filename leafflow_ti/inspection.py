@@ -101,8 +101,9 @@ class _Check:
         baseline = (1.0, 1.0) if geometry is None else (geometry.baseline_mm[0] or 1.0, geometry.baseline_mm[1] or 1.0)
         offset = (0.0, 0.0) if geometry is None else geometry.disparity_offset_px
         extent = Extent(
-            capture.n_frames, capture.n_rows, capture.n_cols, capture.height, capture.width, baseline, offset
-        )
+            capture.n_frames, capture.n_rows, capture.n_cols, capture.height, capture.width, baseline, offset,
+            capture.frame_times,
+        )  # fmt: skip
         device = start("auto", "f32")
         return coarse_search(device, self.image, extent, reference=capture.reference, frame=self.frame,
                              moving=capture.n_frames > 1)  # fmt: skip

@@ -37,7 +37,7 @@ def images(times: tuple[float, ...], px: float) -> np.ndarray:
     return (clean + 0.5 * np.random.default_rng(0).standard_normal(clean.shape)).astype(np.float32)
 
 
-@pytest.mark.parametrize("refine", [0, 3])
+@pytest.mark.parametrize("refine", [0, 8])
 @pytest.mark.parametrize(
     ("times", "frame", "px", "options"),
     [(GAP, 3, 4.0, {"taps_time": "3", "size_time": 1, "refine_frames": (2, 2)}), (PAIR, 0, 6.0, {})],
@@ -45,7 +45,8 @@ def images(times: tuple[float, ...], px: float) -> np.ndarray:
 def test_fast_motion_at_measured_times(
     times: tuple[float, ...], frame: int, px: float, options: dict[str, Any], refine: int
 ) -> None:
-    """A gap of three frames after the reference, and two frames alone, whose results lie between them."""
+    """A gap of three frames after the reference, and two frames alone, whose results lie between them. At the borders
+    the refinement starts from the search, which takes more than three steps."""
     moving = scene(times, px)
     field = lf.estimate(
         moving.capture(images(times, px)), frame, model="affine-scene-flow", preshift="adaptive", window=31, stride=8,

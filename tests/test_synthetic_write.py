@@ -24,6 +24,11 @@ from leafflow_ti.synthetic.write import image_pattern, write_scene
 SCENE = replace(sinusoid_scene(noise=1.0, size=(12, 8)), n_cols=3, n_frames=2, principal_px=(5.0, 4.25))
 
 
+def truth_of(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "truth.npz") as archive:
+        return dict(archive)
+
+
 def command(*args: object) -> int:
     """Exit code of one command line."""
     with pytest.raises(SystemExit) as end:
@@ -159,8 +164,9 @@ def test_simulate_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         supersampling=2,
     )
     np.testing.assert_array_equal(read_images(out, 2, 3), plane.render(scene)[:, 0])
-    np.testing.assert_allclose(np.load(out / "truth.npz")["growth_rate"], scene.growth_rate, rtol=1e-12)
-    np.testing.assert_allclose(np.load(out / "truth.npz")["velocity"], plane.truth(scene)["velocity"], rtol=1e-12)
+    stored_truth = truth_of(out)
+    np.testing.assert_allclose(stored_truth["growth_rate"], scene.growth_rate, rtol=1e-12)
+    np.testing.assert_allclose(stored_truth["velocity"], plane.truth(scene)["velocity"], rtol=1e-12)
 
 
 def test_simulate_plane_with_noise(tmp_path: Path) -> None:
@@ -203,7 +209,7 @@ def test_simulate_cube(tmp_path: Path) -> None:
     )
     stored = np.array([tifffile.imread(out / f"cam_{sx:02d}.tif") for sx in range(2)])
     np.testing.assert_allclose(stored, cube.render(scene)[0, 0], rtol=1e-6)
-    stored_truth = np.load(out / "truth.npz")
+    stored_truth = truth_of(out)
     assert set(np.unique(stored_truth["face"])) == {0, 1, 2}
     np.testing.assert_array_equal(stored_truth["growth_rate"], np.where(stored_truth["face"] > 0, 0.0, np.nan))
 
@@ -236,7 +242,7 @@ def test_simulate_leaves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     np.testing.assert_array_equal(
         tifffile.imread(out / "cam_02" / "frame_001.tif"), leaves.render_image(scene, 1, 0, 2)
     )
-    stored_truth = np.load(out / "truth.npz")
+    stored_truth = truth_of(out)
     assert stored_truth["omega"].shape == (50, 60, 3)
     np.testing.assert_array_equal(stored_truth["face"], leaves.truth(scene)["face"])
 
