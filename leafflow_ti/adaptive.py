@@ -36,6 +36,9 @@ BEYOND = (Status.BORDER, Status.INCOHERENT, Status.NOT_CONVERGED)
 STRAY = 0.75
 """Pixels per step or frame between a measured value and the search's, beyond which it is of another surface, or none:
 the search is good to half a pixel where it is right, and there (Tsukuba) it is right nine times of ten."""
+BEGUN_STEPS = 8
+"""Least number of steps of a refinement that begins with what the search found: planes from whole pixels are farther off
+than what a model measures."""
 UNDECIDED = -1
 """Instead of the number of a label: no pass gave a value."""
 
@@ -265,18 +268,19 @@ class Adaptive:
         assert stay.engine.refine is not None
         assert plan.refine is not None
         part = {name: values[tile.place].copy() for name, values in maps.items()}
-        status = np.where(mine | begun, np.uint8(Status.OK), np.uint8(Status.NOT_COMPUTED))
-        if begun.any():
-            start = coarse_start(surfaces, aims, (tile.y, tile.x), plan)
-            for name in part.keys() & start.keys():
-                part[name][begun] = start[name][begun]
-            status[begun & ~refined_from(plan.refine, part, status)] = Status.NOT_COMPUTED
         place = Place(tile.y, tile.x, (stay.wide.y, stay.wide.x), plan.geometry)
-        self.common.effort += refine_maps(stay.engine.refine, plan.refine, part, status, place)
-        found = mine | (begun & (status == Status.OK))
-        codes[tile.place][found] = status[found]
-        for name, values in part.items():
-            maps[name][tile.place][found] = values[found]
+        for some, steps in ((mine, None), (begun, max(plan.refine.steps, BEGUN_STEPS))):
+            status = np.where(some, np.uint8(Status.OK), np.uint8(Status.NOT_COMPUTED))
+            if some is begun and begun.any():
+                start = coarse_start(surfaces, aims, (tile.y, tile.x), plan)
+                for name in part.keys() & start.keys():
+                    part[name][begun] = start[name][begun]
+                status[begun & ~refined_from(plan.refine, part, status)] = Status.NOT_COMPUTED
+            self.common.effort += refine_maps(stay.engine.refine, plan.refine, part, status, place, steps)
+            found = mine if some is mine else begun & (status == Status.OK)
+            codes[tile.place][found] = status[found]
+            for name, values in part.items():
+                maps[name][tile.place][found] = values[found]
 
 
 def coarse_start(surfaces: Surfaces, aims: Sequence[Aim], at: tuple[range, range], plan: Plan) -> Maps:

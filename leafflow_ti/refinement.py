@@ -42,7 +42,9 @@ class Place:
         return np.stack([x - self.geometry.principal_px[0], y - self.geometry.principal_px[1]], axis=1).astype(float)
 
 
-def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place) -> Effort:
+def refine_maps(
+    stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place, steps: int | None = None
+) -> Effort:
     """Refine every pixel whose status is ok and whose depth is known, in place of ``maps`` [rows, cols] and ``status``;
     returns what it took.
 
@@ -50,7 +52,7 @@ def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArra
     would pass for what does: such pixels keep what the model says. So do those where a robust estimator had to choose
     between surfaces (``support`` below 1): the refinement takes all of the window as one, and would mix them again.
     ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at. Of a
-    ``flat`` patch it is the flow that must be known, not the depth.
+    ``flat`` patch it is the flow that must be known, not the depth. ``steps``: at most so many; None: as planned.
     """
     if "support" in maps:
         status[(status == Status.OK) & (maps["support"] < 1)] = Status.UNREFINED
@@ -58,12 +60,12 @@ def refine_maps(stage: RefineStage, plan: Refinement, maps: Maps, status: NDArra
     if not rows.size:
         return Effort()
     start = _starts(plan, {name: maps[name][rows, cols] for name in starting(plan) if name in maps}, rows.size)
-    found = _call(stage, place, rows, cols, start)
+    found = _call(stage, place, rows, cols, start, steps)
     good, effort = found.converged, found.effort
     parameters, covariance = found.parameters, found.covariance
     again, begin = _neighbours(plan, rows, cols, found, place, status.shape)
     if again.size:
-        second = _call(stage, place, rows[again], cols[again], begin)
+        second = _call(stage, place, rows[again], cols[again], begin, steps)
         effort += second.effort
         better = again[second.converged]
         parameters[better], covariance[better] = (
@@ -133,11 +135,13 @@ def _starts(plan: Refinement, maps: Maps, n: int) -> Array:
     return start
 
 
-def _call(stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array) -> Refined:
+def _call(
+    stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array, steps: int | None = None
+) -> Refined:
     y, x = np.array(place.y)[rows] - place.corner[0], np.array(place.x)[cols] - place.corner[1]
     # A flat patch is the same anywhere in the image; from its own pixel its lengths stay small.
     at = np.zeros((len(y), 2)) if stage.plan.flat else place.rays(rows, cols)
-    return stage(y, x, at, start)
+    return stage(y, x, at, start, steps)
 
 
 def _neighbours(

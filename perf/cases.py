@@ -48,6 +48,12 @@ CASES = (
     Case(
         "hci-cotton", "cotton:run", "real 9x9 light field: disparity and normals of the whole image against its truth"
     ),
+    Case(
+        "leaves",
+        "leaves:run",
+        "leaves that hide each other and move, in changing light: each beside itself alone",
+    ),
+    Case("tsukuba", "tsukuba:run", "real scene of 5 to 14 px of disparity per step, against its truth"),
     Case("yosemite", "yosemite:run", "affine optical flow of the Yosemite sequence against its truth"),
     Case("estimators-scale", "estimators.scale:run", "angular error against the local scale k (Figure 2.6)"),
     Case(

@@ -50,7 +50,7 @@ def test_light_field_disparity_and_normals_of_one_surface(tmp_path: Path) -> Non
 def test_light_field_is_measured_up_to_its_borders_and_better_with_three_preshifts(tmp_path: Path) -> None:
     settings = cotton.Settings(stride=8)
     capture, truth = cotton.open_cotton(tmp_path), cotton.Truth.read()
-    fields = [cotton.estimate_cotton(capture, settings, p) for p in settings.preshifts_px]
+    fields = [cotton.estimate_cotton(capture, settings, preshift=(p, p)) for p in settings.preshifts_px]
     merged = cotton.merge(fields, settings.preshifts_px, cotton.OFFSET_PX)
     medians = []
     for field in (fields[1], merged):

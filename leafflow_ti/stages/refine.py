@@ -167,10 +167,13 @@ class RefineStage:
             plane[:, : self.cols] = mask
             self._mask = self.device.array(plane)
 
-    def __call__(self, y: NDArray[np.int64], x: NDArray[np.int64], rays: Array, start: Array) -> Refined:
+    def __call__(
+        self, y: NDArray[np.int64], x: NDArray[np.int64], rays: Array, start: Array, steps: int | None = None
+    ) -> Refined:
         """Refine the pixels in rows ``y`` and columns ``x`` of the block [n].
 
-        ``rays`` [n, 2]: their positions from the principal point, px; ``start`` [n, 15]: parameters.
+        ``rays`` [n, 2]: their positions from the principal point, px; ``start`` [n, 15]: parameters. ``steps``: at most
+        so many; None: as planned.
         All frames of the window have been pushed.
         """
         from leafflow_ti.kernels.refine_tables import Out, Size
@@ -180,7 +183,8 @@ class RefineStage:
             frames = np.array(list(self._slots))
             cameras = len(self.plan.cameras)
             origin = ((frames[:, None] * cameras + np.arange(cameras)) * self._plane).ravel()
-            size = self.size.copy()
+            size, most = self.size.copy(), steps or self.plan.steps
+            size[Size.STEPS] = most
             size[Size.MASKED] = int(self._mask is not None)
             out = device.zeros(n * Out.N, "algebra")
             device_size = device.array(size, "int")
@@ -190,7 +194,7 @@ class RefineStage:
                 device.array(np.concatenate([rays, start], axis=1), "algebra"), *self._workspaces(), out,
             )  # fmt: skip
             for first in range(0, n, self._batch):
-                self._launch(first, min(self._batch, n - first), arguments)
+                self._launch(first, min(self._batch, n - first), most, arguments)
             found = np.asarray(device.host(out), float).reshape(n, Out.N)
         code, passes, samplings = (found[:, k].astype(np.int64) for k in (Out.CODE, Out.PASSES, Out.SAMPLINGS))
         return Refined(
@@ -204,7 +208,7 @@ class RefineStage:
             device.vectors(self._real, lanes), self._real, device.vectors(self._precise, lanes), self._precise,
         )  # fmt: skip
 
-    def _launch(self, first: int, pixels: int, arguments: tuple[Any, ...]) -> None:
+    def _launch(self, first: int, pixels: int, steps: int, arguments: tuple[Any, ...]) -> None:
         from leafflow_ti.kernels.refine import Stage, refine_kernel
         from leafflow_ti.kernels.refine_tables import FUNCTIONS, SHIFTS, Size
 
@@ -225,7 +229,7 @@ class RefineStage:
                 refine_kernel(spec, taps, stage)(first, pixels, int(parts.get(stage, 1)), 1, *arguments)
 
         launch(range(Stage.BEGIN, Stage.AIM))
-        for _ in range(self.plan.steps):
+        for _ in range(steps):
             launch(range(Stage.AIM, Stage.HALVES))
         launch(range(Stage.HALVES, Stage.FINISH + 1))
 
