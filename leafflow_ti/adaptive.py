@@ -37,8 +37,8 @@ STRAY = 0.75
 """Pixels per step or frame between a measured value and the search's, beyond which it is of another surface, or none:
 the search is good to half a pixel where it is right, and there (Tsukuba) it is right nine times of ten."""
 BEGUN_STEPS = 8
-"""Least number of steps of a refinement that begins with what the search found: planes from whole pixels are farther off
-than what a model measures."""
+"""Least number of steps of a refinement that begins with what the search found, which is farther off than what a model
+measures."""
 UNDECIDED = -1
 """Instead of the number of a label: no pass gave a value."""
 
