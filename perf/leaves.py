@@ -105,7 +105,7 @@ def measure(settings: Settings, out: Path) -> Outcome:
         single = estimate(captured(scene, alone(scene, label)), roi=(*low, *high), **options)
         ok, known, wanted = single.status == Status.OK, exact(scene, label, single), exact(scene, label, found)
         for name in NAMES:
-            level = float(np.sqrt(np.mean((single[name] - known[name])[ok] ** 2)))
+            level = float(np.sqrt(np.nanmean((single[name] - known[name])[ok] ** 2)))
             relative[name][seen] = ((found[name] - wanted[name]) / level)[seen]
             unit = "mm" if name == "depth" else "mm/frame"
             figures.append(Figure(f"leaf {label}, {name}: error of the leaf alone, rms", level, unit))

@@ -106,11 +106,12 @@ def filled(flow: Array, ground: Mask) -> Array:
     return np.asarray(np.where(ground[..., None], flow[y, x], np.nan))
 
 
-def full_density(field: Field, truth: Truth) -> float:
-    """Mean angular error [deg] of all pixels without sky, ``filled``."""
+def full_density(field: Field, truth: Truth, above_px: float = 0.0) -> float:
+    """Mean angular error [deg] of all pixels without sky, ``filled``, that move more than ``above_px`` px/frame."""
     there = np.ix_(field.y, field.x)
     flow = filled(vectors(field, "flow", "xy"), ~truth.sky[there])
-    return float(np.nanmean(aae(flow, truth.flow[there])))
+    fast = np.linalg.norm(truth.flow[there], axis=-1) > above_px
+    return float(np.nanmean(aae(flow, truth.flow[there])[fast]))
 
 
 def density_errors(error: Array, worth: Array) -> list[float]:
@@ -146,23 +147,18 @@ def figures_of(label: str, field: Field, truth: Truth) -> tuple[Figure, ...]:
 
 
 def moved_figures(label: str, fields: dict[str, Field], truth: Truth) -> list[Figure]:
-    """Errors by preshift; of coarse to fine against those without it, on pixels that both have values for."""
-    errors = {preshift: errors_of(field, truth) for preshift, field in fields.items()}
-    first = fields["uniform"]
-    speed = np.linalg.norm(truth.flow, axis=-1)[np.ix_(first.y, first.x)]
-    both = np.all([np.isfinite(error) for error in errors.values()], axis=0)
-    ground = ~truth.sky[np.ix_(first.y, first.x)]
-    figures = []
-    for where, part in (("", both), (f" above {FAST_PX:g} px/frame", both & (speed > FAST_PX))):
-        means = {preshift: float(error[part].mean()) for preshift, error in errors.items()}
+    """Errors by preshift, of all pixels of the ground: with coarse to fine against those without it."""
+    ground, figures = ~truth.sky[np.ix_(fields["uniform"].y, fields["uniform"].x)], []
+    for where, above in (("", 0.0), (f" above {FAST_PX:g} px/frame", FAST_PX)):
+        means = {preshift: full_density(field, truth, above) for preshift, field in fields.items()}
         for preshift, mean in means.items():
             limit = means["uniform"] if preshift == "adaptive" else None
-            name, note = f"AAE{where}, {label}, {preshift}", "of the pixels that both have values for"
-            figures.append(Figure(name, mean, "deg", limit, "uniform", note=note))
+            figures.append(Figure(f"AAE at 100 % density{where}, {label}, {preshift}", mean, "deg", limit, "uniform"))
     for preshift, field in fields.items():
-        density = 100 * float(np.isfinite(errors[preshift])[ground].mean())
+        error = errors_of(field, truth)
+        figures.append(Figure(f"median angular error, {label}, {preshift}", float(np.nanmedian(error)), "deg"))
+        density = 100 * float(np.isfinite(error)[ground].mean())
         figures.append(Figure(f"density, {label}, {preshift}", density, "%"))
-        figures.append(Figure(f"AAE at 100 % density, {label}, {preshift}", full_density(field, truth), "deg"))
     return figures
 
 

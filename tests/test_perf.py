@@ -13,7 +13,8 @@ import pytest
 from leafflow_ti.api import estimate
 from leafflow_ti.errors import InputError, RunError
 from leafflow_ti.runtime import start
-from perf import compare, packages, ratio, scaling, scipy_twin, sequence, stages
+from leafflow_ti.synthetic.leaves import LeavesScene
+from perf import compare, cotton, leaves, packages, ratio, scaling, scipy_twin, sequence, stages
 from perf.__main__ import main
 from perf.bench import Scene, Timed
 from perf.cases import CASES, Case
@@ -22,7 +23,7 @@ from perf.fresh import fresh_run
 from perf.inputs import VARIABLE, read_pfm
 from perf.stage_tables import Tables
 
-REAL = ("hci-cotton", "yosemite", "hypocotyl")
+REAL = ("hci-cotton", "tsukuba", "yosemite", "hypocotyl")
 
 
 def test_the_runner_lists_every_case(capsys: pytest.CaptureFixture[str]) -> None:
@@ -174,6 +175,25 @@ def test_both_models_of_the_ratio_are_timed() -> None:
     found = by_name(ratio.measure(ratio.Settings(SMALL, strides=(4,), repeats=1)))
     one, other = (found[f"{model}, stride 4"].value for model in ratio.MODELS)
     assert found["affine-scene-flow over affine-4d, stride 4"].value == pytest.approx(other / one)
+
+
+def test_leaves_are_put_beside_themselves_alone(tmp_path: Path) -> None:
+    scene = LeavesScene(
+        size=(101, 81), n_cols=3, n_frames=5, leaves=1, disparity_px=(3.0, 6.0), motion_px=2.0, supersampling=1
+    )
+    outcome = leaves.measure(leaves.Settings(scene, window=17, stride=6, refine=0), tmp_path)
+    found = by_name(outcome)
+    assert 50 < found["all leaves, depth"].value <= 100
+    assert found["leaf 1, depth: error of the leaf alone, rms"].value < 0.01 * scene.plants[0].surface.centre[2]
+    assert outcome.pictures[0].exists()
+
+
+def test_discontinuities_are_where_the_truth_jumps() -> None:
+    truth = np.tile(np.where(np.arange(40) < 20, 0.0, 0.5), (30, 1)) + 0.01 * np.arange(40)
+    near = cotton.discontinuities(truth, 3)
+    assert near[:, 16:24].all()
+    assert not near[:, :15].any()
+    assert not near[:, 25:].any()
 
 
 def test_scaling_draws_every_panel(tmp_path: Path) -> None:
