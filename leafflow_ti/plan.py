@@ -275,7 +275,7 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     adaptive = False
     if model.ranges:
         depth = None if config.range_flow.depth else model_problem(capture, static(config), "depth", None)
-        own = replace(depth, noise=noise) if depth else None
+        own = replace(depth, noise=noise, cut=True) if depth else None
         preshift = _uniform(capture, config) if own else (0, 0)
         alone = sampling_of(capture, config, "reference", True)
         frames = _frames(capture, config, alone.t)
@@ -284,7 +284,9 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         problem = model_problem(capture, config, name, motion)
         frames = _frames(capture, config, problem.sampling.t if model.time else None)
         preshift, adaptive = _preshift(capture, config, bool(problem.camera_axes), model.time)
-    problem = replace(problem, noise=noise)
+    # Ranges are invalid here and there.
+    cut = model.ranges or adaptive or _cut(capture, config)
+    problem = replace(problem, noise=noise, cut=cut)
     layout = TensorLayout.of(problem.columns)
     x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
     if x1 > capture.width or y1 > capture.height:
@@ -343,6 +345,11 @@ def _farthest(time: AxisSampling, frames: tuple[int, ...]) -> tuple[float, ...]:
         return tuple(time.positions.tolist())
     found = (tuple(time.about(t).positions.tolist()) for t in frames)
     return max(found, key=lambda offsets: max(map(abs, offsets)))
+
+
+def _cut(capture: Capture, config: RunConfig) -> bool:
+    """Whether windows may hold pixels that do not count: masked ones, ones beyond the image, invalid ones."""
+    return config.output.mask is not None or config.window.border == "clip" or not capture.finite
 
 
 def _geometry(capture: Capture) -> Geometry:

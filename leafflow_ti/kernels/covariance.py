@@ -33,14 +33,15 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
         flow = number[p.n + Number.FLOW]
         moments, packed = region(p, number, Region.MOMENTS), region(p, number, Region.CLEAN)
         quietest = identify.quietest(p, number, ws)
-        floor = V(0.0)
+        own = ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
+        some, floor = small.any_lane(own), V(0.0)
         for r in range(flow):
             for c in range(r + 1):
                 s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride] * s
                 noise = V(ti.select(r == c, value[p.v + Value.NOISE + r], precise(0.0)))
-                if number[p.n + Number.REWEIGHTED] == 1:
-                    noise = ws[region(p, number, Region.WEIGHT_NOISE) + tri(r, c) * p.stride]
+                if some == 1:
+                    noise = ti.select(own, ws[region(p, number, Region.WEIGHT_NOISE) + tri(r, c) * p.stride], noise)
                 if r == c:
                     floor = floor + element * value[p.v + Value.RIDGE]
                 element = element - quietest * noise * (value[p.v + Value.DENOISE] * s)
@@ -92,15 +93,21 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
         if p.which == number[p.n + Number.MOTION_SOLUTION]:
             n_rows, rows_at = number[p.n + Number.ROWS_T], ti.cast(Number.MOTION_ROWS, ti.i32)
             target, cov = region(p, number, Region.RESPONSE_T), region(p, number, Region.COV_T)
-        moments = region(p, number, Region.MOMENTS)
+        moments, cut = region(p, number, Region.MOMENTS), texture.any_cut(p, number, ws)
         noise, product = region(p, number, Region.NOISE), region(p, number, Region.PRODUCT)
+        ratios = region(p, number, Region.CUT_RATIO)
+        classes = p.n + number[p.n + Number.CUT_LISTS] + 3 * number[p.n + Number.CUT_NOISES]
         size = flow * (flow + 1) // 2
         for r in range(flow):
             for c in range(r + 1):
                 s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
                 ratio = value[p.v + Value.RATIO + p.which * size + tri(r, c)]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride]
-                ws[noise + tri(r, c) * p.stride] = element * (s * ratio)
+                element = element * (s * ratio)
+                if cut == 1:
+                    one, two = number[classes + r], number[classes + c]
+                    element = element * ws[ratios + tri(ti.max(one, two), ti.min(one, two)) * p.stride]
+                ws[noise + tri(r, c) * p.stride] = element
         terms = number[p.n + Number.NOISE_TERMS]
         extra = Value.RATIO + number[p.n + Number.SOLUTIONS] * size + p.which * terms
         for term in range(terms):

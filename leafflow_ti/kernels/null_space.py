@@ -18,6 +18,8 @@ from leafflow_ti.kernels.workspace import Number, Region, Value
 JACOBI_SWEEPS = 16
 RITZ_SWEEPS = 8
 ROUNDS = 6
+WHOLE = 0.9999
+"""Share of the weights of a window that is seen from which on it counts as whole."""
 
 
 @functools.cache
@@ -46,8 +48,13 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                     element[i] = ti.cast(J[begin + i], precise)
             ws[moments + k * p.stride] = element
         ws[region(p, number, Region.CONVERGED)] = V(0.0)
-        if number[p.n + Number.REWEIGHTED] == 1:
-            ws[region(p, number, Region.ACTIVE)] = V(1.0)
+        ws[region(p, number, Region.ACTIVE)] = V(1.0)
+        own = V(ti.cast(number[p.n + Number.REWEIGHTED], precise))
+        if number[p.n + Number.MASK_PLANES] > 0:
+            mass = ws[moments + number[p.n + Number.EXTRA] * p.stride]
+            cut = (mass < V(WHOLE)) & (mass >= V(value[p.v + Value.MIN_MASS]))
+            own = ti.select(cut, V(1.0), V(0.0))
+        ws[region(p, number, Region.OWN_NOISE)] = own
 
     @ti.func
     def left_out(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
@@ -119,10 +126,9 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def unsolved(p: ti.template(), number: ti.template(), ws: ti.template()):
-        """A new solution is wanted: where windows are weighted anew only there."""
+        """A new solution is wanted, of the active pixels only."""
         flag = region(p, number, Region.CONVERGED)
-        if number[p.n + Number.REWEIGHTED] == 1:
-            ws[flag] = ti.select(ws[region(p, number, Region.ACTIVE)] > V(0.5), V(0.0), ws[flag])
+        ws[flag] = ti.select(ws[region(p, number, Region.ACTIVE)] > V(0.5), V(0.0), ws[flag])
 
     @ti.func
     def accept(
@@ -264,13 +270,11 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
             for r in range(n):
                 at = vectors + (r * k + j) * p.stride
                 ws[at] = ws[at] * inverse
-        chosen = V(1.0)
-        if number[p.n + Number.REWEIGHTED] == 1:
-            chosen = ws[region(p, number, Region.ACTIVE)]
+        chosen = ws[region(p, number, Region.ACTIVE)] > V(0.5)
         for j in range(k):
             for f in range(flow):
                 at = target + (j * flow + f) * p.stride
-                ws[at] = ti.select(chosen > V(0.5), ws[vectors + (f * k + j) * p.stride], ws[at])
+                ws[at] = ti.select(chosen, ws[vectors + (f * k + j) * p.stride], ws[at])
 
     @ti.func
     def weighted_noise(
@@ -295,7 +299,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
         """Image noise variance ``p^T J p / p^T C p`` that the residual of each solution amounts to."""
         n, k, flow = number[p.n + Number.N], number[p.n + Number.SOLUTIONS], number[p.n + Number.FLOW]
         vectors, images = region(p, number, Region.VECTORS), region(p, number, Region.IMAGES)
-        found = region(p, number, Region.PARAMETERS)
+        found, anew = region(p, number, Region.PARAMETERS), ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
         for j in range(k):
             norm = V(0.0)
             for r in range(n):
@@ -305,8 +309,8 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                     element = ws[found + (j * flow + r) * p.stride] * unit
                 norm = norm + element * element * (value[p.v + Value.NOISE + r] / (unit * unit))
                 ws[vectors + (r * k + j) * p.stride] = element
-            if number[p.n + Number.REWEIGHTED] == 1:
-                norm = weighted_noise(j, k, p, number, value, ws)
+            if small.any_lane(anew) == 1:
+                norm = ti.select(anew, weighted_noise(j, k, p, number, value, ws), norm)
             ws[region(p, number, Region.VARIANCE) + j * p.stride] = norm
         small.upper_times(ws, region(p, number, Region.TENSOR), vectors, images, n, k, p.stride)
         for j in range(k):
@@ -322,13 +326,15 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     ):
         """``S σ² N_ff p``: what noise adds to J_ff, times solution j, whose scaled entries are in VECTORS."""
         flow, noise = number[p.n + Number.FLOW], region(p, number, Region.WEIGHT_NOISE)
+        own = ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
+        some = small.any_lane(own)
         vectors, variance = region(p, number, Region.VECTORS), ws[region(p, number, Region.VARIANCE) + j * p.stride]
         for r in range(flow):
             total = V(0.0)
             for c in range(flow):
                 element = V(ti.select(r == c, value[p.v + Value.NOISE + r], precise(0.0)))
-                if number[p.n + Number.REWEIGHTED] == 1:
-                    element = ws[noise + tri(ti.max(r, c), ti.min(r, c)) * p.stride]
+                if some == 1:
+                    element = ti.select(own, ws[noise + tri(ti.max(r, c), ti.min(r, c)) * p.stride], element)
                 total = total + element * ws[vectors + (c * k + j) * p.stride] * value[p.v + Value.SCALE + c]
             at = region(p, number, Region.BIAS) + (j * flow + r) * p.stride
             ws[at] = total * variance * value[p.v + Value.SCALE + r]

@@ -2,8 +2,9 @@
 
 Schuchert 2010, Eqs. (5.8), (5.18), (5.23) with the errata of the model contract: the time column uses ``∂X/∂t - N``,
 and preshifted data measure ``b a_s + nu0 a_x`` along a camera axis. The patch moves as ``U = N + Ω × P + ε P``. The
-window's affine fit sees the mean of what it leaves out: on a plane the flow is quadratic in x, y, and its second-order
-part times the window's second moment belongs to the row of the flow itself.
+window's affine fit sees the mean of what it leaves out: on a plane the flow is quadratic in x, y, with the second-order
+part ``(q1 x² + q2 xy, q1 xy + q2 y²)``, and q times the window's second moment belongs to the row of the flow itself;
+in a cut window the part's projection on 1, x, y belongs to the rows of the flow and of its derivatives along x, y.
 """
 
 import functools
@@ -14,6 +15,7 @@ from leafflow_ti.kernels.dense import dense
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.spec import KernelSpec
+from leafflow_ti.kernels.texture import texture_functions
 from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, PATCH_SIZE, Number, Region, Value
 
 RANGE_CODE = 6
@@ -43,7 +45,7 @@ assert len(Patch) <= PATCH_SIZE
 def patch_functions(spec: KernelSpec) -> SimpleNamespace:
     """``pixel_ray``, ``place_patch``, and ``motion_row``, ``range_row``, which leave an equation in ``Region.ROW``."""
     precise, lanes, V = spec.precise, spec.lanes, spec.element
-    small = dense(spec)
+    small, texture = dense(spec), texture_functions(spec)
 
     @ti.func
     def pixel_ray(p: ti.template(), number: ti.template(), value: ti.template()):
@@ -102,7 +104,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         first = 1.0 - second
         along = 0.0 - (x * first + y * second)
         n0, n1, n2, r0, r1, r2, grown = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
-        scale = V(0.0)
+        scale, cut = V(0.0), texture.any_cut(p, number, ws)
         along_s = code == 3 or code == 4
         for part in range(ti.select(along_s, 2, 1)):
             axis, factor = code, f
@@ -114,7 +116,10 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
                 # Half the second derivative of u_k along its own axis: -T_Z d(1/Z) + (Ω × e_Z)_k / f, where
                 # T = N - Ω × X0 - ε X0 is the velocity that the patch's motion has at the camera; along the other axis
                 # it vanishes.
-                turned = value[p.v + Value.SECOND_MOMENT + k] * wide
+                turned = V(value[p.v + Value.SECOND_MOMENT + k])
+                if cut == 1:
+                    turned = ws[region(p, number, Region.CURVED) + 2 * k * stride]
+                turned = turned * wide
                 bent = (ZX * first + ZY * second) * inverse_c * turned
                 n0 = scale * first
                 n1 = scale * second
@@ -152,6 +157,23 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
                 r1 = r1 + scale * (d2 * first - d0 * along)
                 r2 = r2 + scale * (d0 * second - d1 * first)
                 grown = grown + scale * (d0 * first + d1 * second + d2 * along)
+        if cut == 1 and code < 3:
+            for axis in range(2):
+                if code > 0 or axis != k:
+                    moment = 3 * code + ti.select(axis == k, 2 * k, 1)
+                    turned = ws[region(p, number, Region.CURVED) + moment * stride] * wide
+                    slope = ZX
+                    if axis == 1:
+                        slope = ZY
+                    bent = slope * inverse_c * turned
+                    n2 = n2 + bent * inverse
+                    r0 = r0 - bent * y
+                    r1 = r1 + bent * x
+                    if axis == 0:
+                        r1 = r1 + turned
+                    else:
+                        r0 = r0 - turned
+                    grown = grown - bent
         row = region(p, number, Region.ROW)
         ws[row] = n0
         ws[row + stride] = n1

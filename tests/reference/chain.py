@@ -7,6 +7,7 @@ Only the tables (columns, filters, noise factors) come from the library.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.ndimage import correlate1d, minimum_filter
 
 from leafflow_ti.models import AXES, ColumnSet
@@ -183,9 +184,11 @@ def coordinate_scales(columns: ColumnSet, scale):
 
 
 def noise_variance(J, P, columns: ColumnSet, noise):
-    """Image noise variance [k] that each solution's residual amounts to."""
+    """Image noise variance [k] that each solution's residual amounts to; ``noise``: covariance of the columns' noise,
+    or its diagonal."""
     full = np.vstack([P, np.eye(columns.n_time_like)])
-    return np.einsum("ik,ij,jk->k", full, J, full) / np.einsum("ik,i,ik->k", full, noise, full)
+    noise = np.diag(noise) if noise.ndim == 1 else noise
+    return np.einsum("ik,ij,jk->k", full, J, full) / np.einsum("ik,ij,jk->k", full, noise, full)
 
 
 def solution_noise(J, columns: ColumnSet, sampling: Sampling, solution):
@@ -203,7 +206,7 @@ class Solved:
     ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
     the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
     ``support``: mean weight where the window was weighted anew, at most 1; ``biased``: by the noise of all columns but
-    the time-like ones, towards 0.
+    the time-like ones, towards 0. Of a window that is cut also ``ratio`` and ``curved`` of ``cut.Cut``.
     """
 
     J: np.ndarray
@@ -213,12 +216,21 @@ class Solved:
     rho: float
     support: float = 1.0
     biased: bool = False
+    ratio: np.ndarray | float = 1.0
+    curved: np.ndarray | None = None
 
     @classmethod
-    def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
-        """By one of the estimators without weights, see ``solve``."""
-        noise = np.diag(column_noise(sampling, columns))
-        return cls(J, *solve(J, columns, sampling, estimator, scale), noise, rho, biased=estimator == "ols")
+    def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0, cut=None):
+        """By one of the estimators without weights, see ``solve``; ``cut``: of a window that is, its ``cut.Cut``.
+
+        ``rho``: the factor ρ over the share of the window that is seen.
+        """
+        noise = np.diag(column_noise(sampling, columns)) if cut is None else cut.noise
+        found = solve(J, columns, sampling, estimator, scale, None if cut is None else noise)
+        if cut is None:
+            return cls(J, *found, noise, rho, biased=estimator == "ols")
+        rho = rho * cut.share * cut.spread
+        return cls(J, *found, noise, rho, biased=estimator == "ols", ratio=cut.ratio, curved=cut.curved)
 
     def clean(self, denoise):
         """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""
@@ -238,6 +250,12 @@ class Solved:
             x = x + np.linalg.solve(J[:n, :n], held * x - J[:n, :n] @ x - J[:n, n])
         return (S[:n] * x / S[n])[:, None]
 
+    def solution_noise(self, columns: ColumnSet, sampling: Sampling, solution):
+        """As the function of this name; a cut window's ratios are those of the pairs of columns themselves."""
+        n, whole = len(self.P), noise_ratio(sampling, columns, solution)[0]
+        more = self.J[:n, :n] * whole * (self.ratio - 1.0)
+        return solution_noise(self.J, columns, sampling, solution) + more
+
     def covariances(self, columns: ColumnSet, sampling: Sampling, denoise):
         """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions."""
         n, k = columns.n_flow, columns.n_time_like
@@ -247,7 +265,7 @@ class Solved:
             for j, two in enumerate(columns.solutions):
                 M = np.zeros((n, n))
                 if i == j:
-                    M = solution_noise(self.J, columns, sampling, one)
+                    M = self.solution_noise(columns, sampling, one)
                 else:
                     for term in cross_noise(sampling, columns, one, two):
                         M[term.a, term.b] = self.J[term.base_a, term.base_b] * term.value
@@ -269,14 +287,18 @@ def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, d
     return solved.covariances(columns, sampling, denoise)
 
 
-def solve(J, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
+def solve(J, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0, noise=None):
     """Parameters P [n_flow, k] of one of the estimators, and the noise variance [k] of their residuals.
 
-    ``scale``: see ``coordinate_scales``; of raw total least squares.
+    ``scale``: see ``coordinate_scales``; of raw total least squares. ``noise`` [N, N]: covariance of the columns' noise
+    where it is not that of a whole window.
     """
-    noise = column_noise(sampling, columns)
+    own, noise = noise is not None, column_noise(sampling, columns) if noise is None else noise
     if estimator == "ols":
         P = solutions_ols(J, columns)
+    elif own and estimator == "tls-equilibrated":
+        vectors = eigh(J, noise)[1][:, : columns.n_time_like]
+        P = vectors[: columns.n_flow] @ np.linalg.inv(vectors[columns.n_flow :])
     else:
         scales = noise**-0.5 if estimator == "tls-equilibrated" else coordinate_scales(columns, scale)
         P = solutions_tls(J, columns, scales)

@@ -1,7 +1,6 @@
 """Naive float64 twin of what follows the flow parameters: geometry, the fit of the motion, every map of a pixel."""
 
 import numpy as np
-from reference.chain import solution_noise
 
 from leafflow_ti.kernels.patch_fit import HELD
 from leafflow_ti.models import AXES, ColumnSet
@@ -47,11 +46,12 @@ def surface(x0, y0, f, nu, b1=0.0, b2=0.0):
     return Z0, c * p, c * q, c
 
 
-def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 0.0)):
+def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved=None):
     """Design [rows, 10] by (N, Ω, A, ε) of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
 
     Rows run over the directions, then the offsets. The s-offsets are per camera step at the preshifted pixel.
-    ``moments`` (x, y): second moments of the window, of which the flow's own rows see the second derivatives.
+    ``curved`` [3, 3]: projections of x², xy, y² (columns) on 1, x, y over the window, by which these rows see the
+    flow's second-order part.
     """
     nu, b1, b2 = geometry
     Z0, ZX, ZY, c = surface(x0, y0, f, nu, b1, b2)
@@ -77,9 +77,14 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 
 
     def row(k, o):
         r = np.zeros(10)
+        seen = np.zeros(10)
+        if curved is not None and o in ("1", "x", "y"):
+            for f_, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+                half = 0.5 if i == j else 1.0
+                seen += half * curved["1xy".index(o), f_] * second_derivative(x0, y0, f, (Z0, ZX, ZY), k, i, j)
         if o == "1":
             r[:3] = -nu * e[k]
-            return r + moments[k] / 2 * second_derivative(x0, y0, f, (Z0, ZX, ZY), k)
+            return r + seen
         r[:3] = -b[o] * e[k]
         if (o, k) in (("x", 0), ("y", 1)):
             r[2] += nu / f
@@ -88,7 +93,7 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 
         r[9] = -nu * e[k] @ delta[o]
         if o == "t":
             r[6:9] = -nu * e[k]
-        return r
+        return r + seen
 
     def measured(k, o):
         if o == "sx":
@@ -100,8 +105,8 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 
     return np.array([measured(k, o) for k in (0, 1) for o in offsets])
 
 
-def second_derivative(x0, y0, f, plane, k):
-    """Coefficients [10] of (N, Ω, A, ε) of ∂²u_k/∂x_k² on the plane (Z0, ZX, ZY) at (x0, y0), by exact differences.
+def second_derivative(x0, y0, f, plane, k, i, j):
+    """Coefficients [10] of (N, Ω, A, ε) of ∂²u_k/∂x_i∂x_j on the plane (Z0, ZX, ZY) at (x0, y0), by exact differences.
 
     The flow of a rigidly moving plane is quadratic in x and y, so second differences of any width are exact.
     """
@@ -109,14 +114,15 @@ def second_derivative(x0, y0, f, plane, k):
     X0 = Z0 * np.array([x0 / f, y0 / f, 1.0])
 
     def flow(d, q):
-        x, y = (x0 + d, y0) if k == 0 else (x0, y0 + d)
-        ray = np.array([x / f, y / f, 1.0])
+        ray = np.array([(x0 + d[0]) / f, (y0 + d[1]) / f, 1.0])
         X = (Z0 - ZX * X0[0] - ZY * X0[1]) / (1 - ZX * ray[0] - ZY * ray[1]) * ray
         U = q[:3] + np.cross(q[3:6], X - X0) + q[9] * (X - X0)
         return f * (U[k] - ray[k] * U[2]) / X[2]
 
     h = 0.05 * f
-    return np.array([(flow(h, q) - 2 * flow(0, q) + flow(-h, q)) / h**2 for q in np.eye(10)])
+    one, two = h * np.eye(2)[i], h * np.eye(2)[j]
+    found = [sum(s * t * flow(s * one + t * two, q) for s in (1, -1) for t in (1, -1)) for q in np.eye(10)]
+    return np.array(found) / (4 * h**2)
 
 
 def range_row(x0, y0, f, geometry):
@@ -127,13 +133,22 @@ def range_row(x0, y0, f, geometry):
     return r
 
 
-def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampling, own_sampling, step):
+def seen_of(solved, sampling):
+    """``curved`` of ``motion_rows`` for a solution; of a whole window its second moments."""
+    if solved.curved is not None:
+        return solved.curved
+    whole = np.zeros((3, 3))
+    whole[0, 0], whole[0, 2] = sampling.x.moment(2), sampling.y.moment(2)
+    return whole
+
+
+def shared_covariance(found_own, P_inverse, own_inverse, columns, own_columns, sampling, own_sampling, step):
     """Covariance [n_flow, n_flow of the own flow], per σ² ρ, of the motion parameters of grid and camera.
 
     The grid's normal equations hold the image of the camera at ``step`` with the weights of window and smoothing.
     """
     n, m = columns.n_flow, own_columns.n_flow
-    noise = solution_noise(J_own, own_columns, own_sampling, "t")
+    noise = found_own.solution_noise(own_columns, own_sampling, "t")
     X = np.zeros((n, m))
     for a, column in enumerate(columns.columns[:n]):
         factor = 1.0
@@ -173,7 +188,6 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
     columns, sampling, f = problem.columns, problem.sampling, view.f_px
     shift, baseline = view.shift_px, view.baseline_mm
     names, g, cov_g, cross_g = geometry
-    moments = sampling.x.moment(2), sampling.y.moment(2)
     surface_terms = np.zeros(3)
     surface_terms[: min(3, len(g))] = g[:3]
     k = columns.solutions.index("t")
@@ -210,7 +224,7 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
             codes.append("range")
 
         def design(geometry, q):
-            A = motion_rows(x0, y0, f, geometry, problem.offsets, q, shift, baseline, moments)
+            A = motion_rows(x0, y0, f, geometry, problem.offsets, q, shift, baseline, seen_of(solved, sampling))
             return np.vstack([A, range_row(x0, y0, f, geometry)]) if problem.use_range else A
 
         return rows_of(value, C, shared, design, codes, problem.use_range, q), rows
@@ -233,13 +247,13 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
             Z0, ZX, ZY, _ = surface(x0, y0, f, *geometry)
             c = 1 - ZX * x / f - ZY * y / f
             there = (-f / Z0, ZX / (Z0 * c), ZY / (Z0 * c))
-            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, moments)
+            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, seen_of(found_own, sampling))
 
         codes = [*flows.offsets, *flows.offsets]
         found = rows_of(E @ p[:, 0], E @ C @ E.T, np.zeros((len(g), len(rows))), design, codes, False, q)
         own_inverse = np.linalg.inv(found_own.clean(denoise))
         shared = shared_covariance(
-            found_own.J, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
+            found_own, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
         ) * (found_own.rho * np.sqrt(solved.variance[k] * s2[0]))
         return found, shared @ E.T
 
