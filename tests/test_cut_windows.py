@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import OWN_FLOW_CASES
 from tolerances import tolerance
 
 from leafflow_ti.models import MODELS
@@ -21,6 +20,7 @@ CUT = [(model, "none" if "flow" in model else "spatial", grid) for model, grid i
     ("affine-translation", "line-x"), ("affine", "square"), ("affine-4d", "line-y"), ("affine-5d", "square"),
     ("affine-scene-flow", "line-x"), ("scene-flow", "line-x"),
 )]  # fmt: skip
+ALONE = [c for c in CUT if not MODELS[c[0]].own_flows]
 MASKS = ("half", "corner", "spots")
 
 
@@ -34,16 +34,18 @@ def masked(b: Any, mask: str) -> Any:
     if mask == "corner":
         valid[:, : y - 3] = False
     if mask == "spots":
-        valid[3, y - 4, x - 2] = valid[4, y + 1, x + 5] = False
+        valid[t // 2, y - 4, x - 2] = valid[-1, y + 1, x + 5] = False
     return replace(b, valid=valid)
 
 
 @pytest.mark.parametrize("estimator", ["ols", "tls", "tls-equilibrated"])
 @pytest.mark.parametrize("mask", MASKS)
-@pytest.mark.parametrize(("model", "brightness", "grid"), CUT)
+@pytest.mark.parametrize(("model", "brightness", "grid"), ALONE)
 def test_parameters_equal_the_twin(
     bench: Callable, model: str, brightness: str, grid: str, mask: str, precision: str, estimator: str
 ) -> None:
+    if model == "flow-quadratic" and mask != "spots":
+        pytest.skip("half of so small a window does not determine second derivatives")
     b = masked(bench(model, brightness, grid, precision), mask)
     found = {solver: b.estimate(estimator=estimator, solver=solver) for solver in ("fast", "jacobi")}
     for pixel in ((1, 3), (1, 0), (2, 4)):

@@ -8,6 +8,7 @@ one more smoothing.
 import functools
 from types import SimpleNamespace
 
+from leafflow_ti.kernels.cut import cut_stages
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
@@ -22,6 +23,7 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``clean``, then ``row_covariance`` and ``add_camera`` per solution, and ``geometry``."""
     precise, V = spec.precise, spec.element
     small, texture, identify = dense(spec), texture_functions(spec), identify_functions(spec)
+    windows = cut_stages(spec)
 
     @ti.func
     def clean(
@@ -95,25 +97,26 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
             target, cov = region(p, number, Region.RESPONSE_T), region(p, number, Region.COV_T)
         moments, cut = region(p, number, Region.MOMENTS), texture.any_cut(p, number, ws)
         noise, product = region(p, number, Region.NOISE), region(p, number, Region.PRODUCT)
-        ratios = region(p, number, Region.CUT_RATIO)
-        classes = p.n + number[p.n + Number.CUT_LISTS] + 3 * number[p.n + Number.CUT_NOISES]
         size = flow * (flow + 1) // 2
         for r in range(flow):
             for c in range(r + 1):
                 s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
                 ratio = value[p.v + Value.RATIO + p.which * size + tri(r, c)]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride]
-                element = element * (s * ratio)
-                if cut == 1:
-                    one, two = number[classes + r], number[classes + c]
-                    element = element * ws[ratios + tri(ti.max(one, two), ti.min(one, two)) * p.stride]
-                ws[noise + tri(r, c) * p.stride] = element
+                ws[noise + tri(r, c) * p.stride] = element * (s * ratio)
+        if cut == 1:
+            windows.equation_noise(noise, p, number, value, ws)
         terms = number[p.n + Number.NOISE_TERMS]
         extra = Value.RATIO + number[p.n + Number.SOLUTIONS] * size + p.which * terms
         for term in range(terms):
             at = p.n + Number.LOWER + tri(number[p.n + Number.N], 0) + 2 * term
             own = noise + number[at] * p.stride
-            ws[own] = ws[own] + ws[moments + number[at + 1] * p.stride] * value[p.v + extra + term]
+            share = ws[moments + number[at + 1] * p.stride] * value[p.v + extra + term]
+            if cut == 1:
+                if windows.of_image_square(term, p, number) == 1:
+                    whole = ws[region(p, number, Region.OWN_NOISE)] < V(0.5)
+                    share = ti.select(whole, share, V(0.0))
+            ws[own] = ws[own] + share
         response(target, rows_at, n_rows, p, number, value, ws)
         small.symmetric_times(ws, noise, target, product, flow, n_rows, p.stride)
         factor = texture.smoothness(p, number, ws) * ws[region(p, number, Region.VARIANCE) + p.which * p.stride]

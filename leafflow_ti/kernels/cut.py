@@ -1,7 +1,7 @@
 """Windows that a mask or a border cuts: what is known beforehand of whole ones, from the moments of their valid part.
 
 With v = 1 for valid samples, ``W_e = Σ w v Δ^e``: the noise covariance of the columns is a sum of these (2.24), no
-longer diagonal; that of the normal equations' noise, a sum over w², follows from the ratio of the moments of w² and w;
+longer diagonal; that of the normal equations' noise, a sum over w², follows from the moments of w² and w;
 and the second-order part of the flow of a moving plane, which the affine fit takes for its parameters, is projected on
 1, x, y over what is seen. The lists are those of ``stages.mask_moments``.
 """
@@ -15,16 +15,13 @@ from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.workspace import Number, Region, Value
 
-UNLIKE = 0.01
-"""Squared correlation of two offsets over a window below which the ratio of their moments says less and less: where it
-is 0 the geometric mean of the two offsets' own ratios is taken, as in whole windows."""
 XX, XXX = 3, 6
 """Where the moments of second and of third degree in x and y begin among the plain ones, behind 1, x, y."""
 
 
 @functools.cache
 def cut_stages(spec: KernelSpec) -> SimpleNamespace:
-    """The stage ``cut_windows``."""
+    """The stage ``cut_windows``; ``equation_noise`` and ``of_image_square`` for that of the covariances."""
     precise, lanes, V = spec.precise, spec.lanes, spec.element
     small = dense(spec)
 
@@ -58,30 +55,90 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
             ws[at] = ws[at] + ti.select(cut, moment * value[factors + e], V(0.0))
 
     @ti.func
-    def ratios(
+    def shapes(
         cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
     ):
-        """CUT_RATIO: the ratio of the moments of w² and w for each pair of classes of columns, relative to that of the
-        whole window and to that of the constants, which becomes SPREAD."""
-        classes, mask = number[p.n + Number.CLASSES], region(p, number, Region.MASK)
-        pairs = p.n + number[p.n + Number.CUT_LISTS] + 3 * number[p.n + Number.CUT_NOISES] + number[p.n + Number.FLOW]
+        """CUT_SHAPE: X [shapes, shapes] with ``X^T W X = W2``, the shapes' products over the window with the weights w
+        and w², relative to X of the constant; of that, squared and relative to the whole window's, SPREAD."""
+        n, mask = number[p.n + Number.SHAPES], region(p, number, Region.MASK)
+        lists = p.n + number[p.n + Number.CUT_LISTS] + 3 * number[p.n + Number.CUT_NOISES]
+        factors = p.v + number[p.n + Number.CUT_VALUES] + number[p.n + Number.CUT_NOISES]
+        plain, squared = region(p, number, Region.CUT_PRODUCTS), region(p, number, Region.CUT_SQUARED)
+        target, size, terms = region(p, number, Region.CUT_SHAPE), tri(n, 0), number[p.n + Number.CUT_PRODUCTS]
+        small.clear(ws, plain, size, p.stride)
+        small.clear(ws, squared, size, p.stride)
+        for e in range(terms):
+            at, one, two = number[lists + 3 * e], number[lists + 3 * e + 1], number[lists + 3 * e + 2]
+            factor = value[factors + e]
+            ws[plain + at * p.stride] = ws[plain + at * p.stride] + ws[mask + one * p.stride] * factor
+            ws[squared + at * p.stride] = ws[squared + at * p.stride] + ws[mask + two * p.stride] * factor
+        for which in range(2):
+            small.cholesky(ws, ti.select(which == 0, plain, squared), n, -1, p.stride)
+        # W = L L^T, W2 = M M^T: X = L^-T M^T. Factors hold the inverses of their diagonals.
+        for r in range(n):
+            for c in range(n):
+                element = V(0.0)
+                if c > r:
+                    element = ws[squared + tri(c, r) * p.stride]
+                elif c == r:
+                    element = 1.0 / ws[squared + tri(r, r) * p.stride]
+                ws[target + (r * n + c) * p.stride] = element
+        small.substitute(ws, plain, target, n, n, 1, 2, p.stride)
+        first = ws[target]
+        ws[region(p, number, Region.SPREAD)] = first * first / value[factors + terms]
+        for e in range(n * n):
+            unit = V(ti.cast(e % (n + 1) == 0, precise))
+            ws[target + e * p.stride] = ti.select(cut, ws[target + e * p.stride] / first, unit)
+
+    @ti.func
+    def equation_noise(
+        target: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
+    ):
+        """Put the noise of the normal equations of solution ``which``, packed at ``target``, in the cut windows of the
+        group: ``(B J_ff B^T) ∘ K'``, B being X^T among the columns of one family and K' what cameras and frames add.
+
+        Where the texture is as strong all over the window, that is the sum over w².
+        """
+        flow, n, half = number[p.n + Number.FLOW], number[p.n + Number.SHAPES], region(p, number, Region.FULL)
+        columns = p.n + number[p.n + Number.CUT_LISTS] + 3 * number[p.n + Number.CUT_NOISES]
+        columns += 3 * number[p.n + Number.CUT_PRODUCTS]
         whole = p.v + number[p.n + Number.CUT_VALUES] + number[p.n + Number.CUT_NOISES]
-        target, spread = region(p, number, Region.CUT_RATIO), V(1.0)
-        for i in range(classes):
-            one = pairs + 2 * tri(i, i)
-            for j in range(i + 1):
-                two, both = pairs + 2 * tri(j, j), pairs + 2 * tri(i, j)
-                plain = ws[mask + number[one] * p.stride] * ws[mask + number[two] * p.stride]
-                squared = ws[mask + number[one + 1] * p.stride] * ws[mask + number[two + 1] * p.stride]
-                root, root_squared = ti.sqrt(ti.max(plain, V(1e-30))), ti.sqrt(ti.max(squared, V(1e-30)))
-                alike = ws[mask + number[both] * p.stride] / root
-                alike_squared = ws[mask + number[both + 1] * p.stride] / root_squared
-                ratio = root_squared / root * (alike * alike_squared + UNLIKE) / (alike * alike + UNLIKE)
-                ratio = ratio / value[whole + tri(i, j)]
-                if i == 0:
-                    spread = ratio
-                ws[target + tri(i, j) * p.stride] = ti.select(cut, ratio / spread, V(1.0))
-        ws[region(p, number, Region.SPREAD)] = spread
+        whole += number[p.n + Number.CUT_PRODUCTS] + 1
+        moments, turn = region(p, number, Region.MOMENTS), region(p, number, Region.CUT_SHAPE)
+        ratios = p.v + Value.RATIO + p.which * tri(flow, 0)
+        cut = ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
+        for part in range(2):
+            for r in range(flow):
+                for c in range(ti.select(part == 0, flow, r + 1)):
+                    # Column c of J, then row r of the half-turned matrix.
+                    mine = ti.select(part == 0, r, c)
+                    total = V(0.0)
+                    for a in range(flow):
+                        if number[columns + 2 * a + 1] == number[columns + 2 * mine + 1]:
+                            at = half + (r * flow + a) * p.stride
+                            element = V(0.0)
+                            if part == 0:
+                                at = moments + number[p.n + Number.LOWER + tri(ti.max(a, c), ti.min(a, c))] * p.stride
+                                element = ws[at]
+                            else:
+                                element = ws[at]
+                            one, two = number[columns + 2 * a], number[columns + 2 * mine]
+                            total = total + element * ws[turn + (one * n + two) * p.stride]
+                    if part == 0:
+                        ws[half + (r * flow + c) * p.stride] = total
+                    else:
+                        one, two = number[columns + 2 * r], number[columns + 2 * c]
+                        s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
+                        s *= value[ratios + tri(r, c)] * value[whole + tri(ti.max(one, two), ti.min(one, two))]
+                        at = target + tri(r, c) * p.stride
+                        ws[at] = ti.select(cut, total * s, ws[at])
+
+    @ti.func
+    def of_image_square(term: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
+        """Whether a term that centred squares add to the noise is of squares of x or y: in cut windows there is none."""
+        lists = p.n + number[p.n + Number.CUT_LISTS] + 3 * number[p.n + Number.CUT_NOISES]
+        lists += 3 * number[p.n + Number.CUT_PRODUCTS] + 2 * number[p.n + Number.FLOW]
+        return number[lists + term]
 
     @ti.func
     def curved(
@@ -124,7 +181,7 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
         if small.any_lane(cut) == 1:
             load_moments(p, number, ws, J)
             noise(cut, p, number, value, ws)
-            ratios(cut, p, number, value, ws)
+            shapes(cut, p, number, value, ws)
             curved(cut, p, number, value, ws)
 
-    return SimpleNamespace(cut_windows=cut_windows)
+    return SimpleNamespace(cut_windows=cut_windows, equation_noise=equation_noise, of_image_square=of_image_square)

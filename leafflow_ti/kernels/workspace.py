@@ -80,8 +80,10 @@ class Region(IntEnum):
     WEIGHT_NOISE = auto()  # packed [N]: Σ w ω C, as the tensor now is; of the fundamental scheme what it takes off
     NOISE_FACTOR = auto()  # packed [N]: its factor, scaled; these two empty unless windows are cut or weighted anew
     SPREAD = auto()  # [1]: what mask or weights make of the variance of the normal equations' noise
-    MASK = auto()  # [planes]: moments of the valid part of the window; these and the next three empty unless cut
-    CUT_RATIO = auto()  # packed [classes]: of the moments of w² and w, relative to the whole window's and to SPREAD
+    MASK = auto()  # [planes]: moments of the valid part of the window; these and the next five empty unless cut
+    CUT_PRODUCTS = auto()  # packed [shapes]: the shapes' products over the window, then their factor
+    CUT_SQUARED = auto()  # packed [shapes]: the same with the squared weights
+    CUT_SHAPE = auto()  # [shapes, shapes]: what leads from the former to the latter
     CURVED = auto()  # [3, 3]: x², xy, y² projected on 1, x, y
     CURVED_FACTOR = auto()  # packed [3]
     SHARE = auto()  # [1]: mean weight; from here on: empty unless windows are weighted anew
@@ -103,8 +105,8 @@ class Layout:
     ``moments``: planes of the largest tensor. ``rows_t`` and ``motion``: the largest numbers of motion rows and of
     equations of any camera. ``unknowns`` of the motion fit; ``correlated``: columns whose noise cameras share;
     ``maps``: output planes; ``sources``, ``monomials``: of the largest cell where windows are weighted anew, else 0;
-    ``biased``: solutions are, by the noise of all columns but the time-like ones; ``mask``, ``classes``: moments of cut
-    windows and classes of columns, 0 where none is cut.
+    ``biased``: solutions are, by the noise of all columns but the time-like ones; ``mask``, ``shapes``: moments of cut
+    windows and shapes of columns, 0 where none is cut.
     """
 
     n: int
@@ -121,7 +123,7 @@ class Layout:
     monomials: int = 0
     biased: bool = False
     mask: int = 0
-    classes: int = 0
+    shapes: int = 0
 
     @property
     def sizes(self) -> dict[Region, int]:
@@ -193,7 +195,9 @@ class Layout:
             Region.NOISE_FACTOR: own * packed(n),
             Region.SPREAD: own,
             Region.MASK: self.mask,
-            Region.CUT_RATIO: packed(self.classes),
+            Region.CUT_PRODUCTS: packed(self.shapes),
+            Region.CUT_SQUARED: packed(self.shapes),
+            Region.CUT_SHAPE: self.shapes**2,
             Region.CURVED: 9 * cut,
             Region.CURVED_FACTOR: 6 * cut,
             Region.SHARE: anew,
@@ -256,8 +260,9 @@ class Number(IntEnum):
     MASK_PLANES = auto()  # moments of the valid part of windows; 0: none is cut, and the next six mean nothing
     MASK_PLANE = auto()  # where they begin among the planes
     CURVED_BASIS = auto()  # 3: the flow's second-order part is projected on 1, x, y; 1: on 1
-    CLASSES = auto()  # of columns by their offset in x and y
+    SHAPES = auto()  # of columns by their offsets in x and y
     CUT_NOISES = auto()  # terms of the noise's covariance
+    CUT_PRODUCTS = auto()  # terms of the shapes' products
     CUT_LISTS = auto()  # where the lists of ``stages.mask_moments`` begin behind this table's first entry
     CUT_VALUES = auto()  # likewise in the table of values
     REWEIGHTED = auto()  # windows are weighted anew; what begins with CELL or SOURCE means something only then

@@ -163,7 +163,7 @@ class ProblemTables:
             columns.n_flow if own and own.reference_rows else 0, Output.PLANES,
             max((len(c.sources) for c in self._cells), default=0),
             max((len(c.monomials) for c in self._cells), default=0), self._estimator.biased,
-            self._mask.n_planes if self._mask else 0, self._n_classes,
+            self._mask.n_planes if self._mask else 0, self._n_shapes,
         )  # fmt: skip
         self.reference = self._with_cells(self._reference_tables(rows, layout), 0)
         self.tables = [self.reference]
@@ -275,13 +275,13 @@ class ProblemTables:
         return self._with_cut(Tables(number, value), columns, sampling)
 
     @property
-    def _n_classes(self) -> int:
-        """Most classes of columns of any data vector, where windows may be cut."""
+    def _n_shapes(self) -> int:
+        """Most shapes of columns of any data vector, where windows may be cut."""
         if not self._mask:
             return 0
         own = self.problem.own_flows
         columns = [self.problem.columns, *([own.columns] if own else [])]
-        return max(len(CutTables(c, self.problem.sampling, self._mask).classes) for c in columns)
+        return max(len(CutTables(c, self.problem.sampling, self._mask).shapes) for c in columns)
 
     def _with_cut(self, tables: Tables, columns: ColumnSet, sampling: Sampling) -> Tables:
         """The same tables, and what takes the place of the moments of whole windows where they are cut."""
@@ -291,8 +291,8 @@ class ProblemTables:
         cut = CutTables(columns, sampling, self._mask)
         self._set_numbers(
             tables.number, MASK_PLANES=self._mask.n_planes, MASK_PLANE=self._first_plane[-1],
-            CURVED_BASIS=3 if self._mask.affine else 1, CLASSES=len(cut.classes), CUT_NOISES=len(cut.noises),
-            CUT_LISTS=len(tables.number), CUT_VALUES=len(tables.value),
+            CURVED_BASIS=3 if self._mask.affine else 1, SHAPES=len(cut.shapes), CUT_NOISES=len(cut.noises),
+            CUT_PRODUCTS=len(cut.products), CUT_LISTS=len(tables.number), CUT_VALUES=len(tables.value),
         )  # fmt: skip
         number = np.concatenate([tables.number, np.array(cut.lists, np.int32)])
         return Tables(number, np.concatenate([tables.value, cut.values]))

@@ -16,8 +16,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.models import AXES, ColumnSet
-from leafflow_ti.sampling import Sampling, channel_noise, pixel_factor
+from leafflow_ti.models import AXES, Column, ColumnSet
+from leafflow_ti.sampling import Sampling, channel_noise, noise_ratio, pixel_factor
 from leafflow_ti.stages.channels import Request
 
 Array = NDArray[np.float64]
@@ -68,10 +68,10 @@ class MaskMoments:
         for request in requests:
             terms = noise_terms(request.columns, request.sampling, ("x", "y", "t"))
             plain |= {(e[0], e[1], e[2]): None for *_, e, _ in terms}
-            for one, two in product(_classes(request.columns), repeat=2):
-                both = (one[0] + two[0], one[1] + two[1])
-                plain[*both, 0] = None
-                squared[both] = None
+            for one, two in product(shapes_of(request.columns), repeat=2):
+                for both, _ in _product(one, two):
+                    plain[*both, 0] = None
+                    squared[both] = None
         return cls(tuple(plain), tuple(squared), affine)
 
     @property
@@ -80,10 +80,26 @@ class MaskMoments:
         return len(self.plain) + len(self.squared)
 
 
-def _classes(columns: ColumnSet) -> list[tuple[int, int]]:
-    """Exponents (x, y) that occur among the columns that are not time-like, the constant first."""
-    found = [c.terms[0].exponents[:2] for c in columns.columns[: columns.n_flow]]
-    return list(dict.fromkeys([(0, 0), *((e[0], e[1]) for e in found)]))
+Polynomial = tuple[tuple[tuple[int, int], float], ...]
+"""A polynomial of x and y: exponents and factors."""
+
+
+def shape_of(column: Column) -> Polynomial:
+    """What a column depends on x and y by; of range flow, whose columns mix channels, nothing."""
+    others = column.terms[0].exponents[2:]
+    alike = [t for t in column.terms if t.exponents[2:] == others]
+    if len({t.channel for t in column.terms}) > 1:
+        return (((0, 0), 1.0),)
+    return tuple(((t.exponents[0], t.exponents[1]), t.factor) for t in alike)
+
+
+def shapes_of(columns: ColumnSet) -> list[Polynomial]:
+    """The different shapes of the columns that are not time-like, the constant first."""
+    return list(dict.fromkeys([(((0, 0), 1.0),), *(shape_of(c) for c in columns.columns[: columns.n_flow])]))
+
+
+def _product(one: Polynomial, two: Polynomial) -> Polynomial:
+    return tuple(((p[0] + q[0], p[1] + q[1]), f * g) for (p, f), (q, g) in product(one, two))
 
 
 @dataclass(frozen=True)
@@ -105,35 +121,45 @@ class CutTables:
         return [(*term, factor) for term, factor in found.items()]
 
     @cached_property
-    def classes(self) -> list[tuple[int, int]]:
-        """Kinds of columns by their exponents (x, y): what the noise of a pair of columns depends on."""
-        return _classes(self.columns)
+    def shapes(self) -> list[Polynomial]:
+        """As ``shapes_of`` has them."""
+        return shapes_of(self.columns)
 
-    @property
-    def pairs(self) -> list[tuple[int, int, float]]:
-        """Of each pair of classes (packed): planes of its plain and of its squared moment, and the ratio of the two of
-        a whole window."""
+    @cached_property
+    def products(self) -> list[tuple[int, int, int, float]]:
+        """Element of the packed triangle of shapes, plane of the plain and of the squared moment, factor: the terms of
+        the shapes' products over the window."""
         plain, squared, found = self.moments.plain, self.moments.squared, []
-        for i, one in enumerate(self.classes):
-            for two in self.classes[: i + 1]:
-                both = (one[0] + two[0], one[1] + two[1])
-                whole = math.prod(
-                    pixel_factor(axis, m, n)
-                    for axis, m, n in zip((self.sampling.x, self.sampling.y), one, two, strict=True)
-                )
-                found.append((plain.index((*both, 0)), len(plain) + squared.index(both), whole))
+        pairs = [(one, two) for i, one in enumerate(self.shapes) for two in self.shapes[: i + 1]]
+        for element, (one, two) in enumerate(pairs):
+            for e, factor in _product(one, two):
+                found.append((element, plain.index((*e, 0)), len(plain) + squared.index(e), factor))
         return found
 
     @property
     def lists(self) -> list[int]:
-        """What the table ``number`` gets: row, column and plane of the noise's terms; the class of each column that is
-        not time-like; planes of each pair of classes."""
-        noises = [n for term in self.noises for n in term[:3]]
+        """What the table ``number`` gets: row, column and plane of the noise's terms; element and planes of the terms
+        of the shapes' products; of each column that is not time-like its shape and its family, the columns that differ
+        from it in shape alone; and whether a term of ``noise_ratio`` is of squares in the image."""
         flow = self.columns.columns[: self.columns.n_flow]
-        of = [self.classes.index((c.terms[0].exponents[0], c.terms[0].exponents[1])) for c in flow]
-        return [*noises, *of, *(n for pair in self.pairs for n in pair[:2])]
+        kinds = [(c.channel, c.terms[0].exponents[2:]) for c in flow]
+        of = [n for c, kind in zip(flow, kinds, strict=True) for n in (self.shapes.index(shape_of(c)), kinds.index(kind))]
+        square = [max(c.terms[0].exponents[:2]) > 1 for c in flow]
+        _, terms = noise_ratio(self.sampling, self.columns, self.columns.solutions[0])
+        noises = [n for term in self.noises for n in term[:3]]
+        return [*noises, *(n for term in self.products for n in term[:3]), *of, *(square[t.a] or square[t.b] for t in terms)]
 
     @property
     def values(self) -> Array:
-        """What the table ``value`` gets: factors of the noise's terms, the ratios of whole windows."""
-        return np.array([*(term[3] for term in self.noises), *(pair[2] for pair in self.pairs)])
+        """What the table ``value`` gets: factors of the noise's terms and of the products'; for each pair of shapes
+        (packed) the ratio of the moments of w² and w of a whole window, of the constant's to its own."""
+        whole = [
+            math.prod(
+                pixel_factor(axis, m, n)
+                for axis, m, n in zip((self.sampling.x, self.sampling.y), one[0][0], two[0][0], strict=True)
+            )
+            for i, one in enumerate(self.shapes)
+            for two in self.shapes[: i + 1]
+        ]
+        factors = (*(term[3] for term in self.noises), *(term[3] for term in self.products))
+        return np.array([*factors, whole[0], *(whole[0] / w for w in whole)])

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from scipy.ndimage import correlate1d, minimum_filter
 
 from leafflow_ti.models import AXES, ColumnSet
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio
+from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio, pixel_factor
 
 ARRAY_AXIS = {"t": 0, "sy": 1, "sx": 2, "y": 3, "x": 4}
 
@@ -145,19 +145,27 @@ def at_centre(P, cov, columns: ColumnSet):
     return T.T @ P, T.T @ cov @ T
 
 
-def texture_smoothness(images, sampling: Sampling, x, y):
-    """The factor ρ: energy of the reference camera's gradient smoothed once more in x and y, over its energy."""
+def texture_smoothness(images, sampling: Sampling, x, y, valid=None):
+    """The factor ρ: energy of the reference camera's gradient smoothed once more in x and y, over its energy.
+
+    Of pixels at which also the filters that smooth once more see what is ``valid`` [t, y, x] alone.
+    """
     middle = [sampling.axis(a).before for a in ("t", "sy", "sx")]
     h, w = sampling.y.size // 2, sampling.x.size // 2
     window = np.outer(sampling.y.weights, sampling.x.weights)
     energy = np.zeros(2)
+    seen = np.ones((len(images), *images.shape[3:]))
+    if valid is not None:
+        size = [sampling.t.taps, 2 * sampling.y.taps - 1, 2 * sampling.x.taps - 1]
+        seen = minimum_filter(valid.astype(float), size, mode="nearest", origin=[-1 + size[0] % 2, 0, 0])
     for channel in ("x", "y"):
         gradient = derivative(images, sampling, channel)[:, middle[1], middle[2]]
         for i, weight in enumerate(sampling.t.weights, start=middle[0] - sampling.t.size // 2):
             smooth = correlate1d(gradient[i], sampling.y.kernel(False), axis=0)
             smooth = correlate1d(smooth, sampling.x.kernel(False), axis=1)
             for k, image in enumerate((gradient[i], smooth)):
-                energy[k] += weight * np.sum(window * image[y - h : y + h + 1, x - w : x + w + 1] ** 2)
+                at = np.s_[y - h : y + h + 1, x - w : x + w + 1]
+                energy[k] += weight * np.sum(window * seen[i][at] * image[at] ** 2)
     return energy[1] / energy[0]
 
 
@@ -206,7 +214,7 @@ class Solved:
     ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
     the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
     ``support``: mean weight where the window was weighted anew, at most 1; ``biased``: by the noise of all columns but
-    the time-like ones, towards 0. Of a window that is cut also ``ratio`` and ``curved`` of ``cut.Cut``.
+    the time-like ones, towards 0. Of a window that is cut also ``turn`` and ``curved`` of ``cut.Cut``.
     """
 
     J: np.ndarray
@@ -216,7 +224,7 @@ class Solved:
     rho: float
     support: float = 1.0
     biased: bool = False
-    ratio: np.ndarray | float = 1.0
+    turn: np.ndarray | None = None
     curved: np.ndarray | None = None
 
     @classmethod
@@ -230,7 +238,7 @@ class Solved:
         if cut is None:
             return cls(J, *found, noise, rho, biased=estimator == "ols")
         rho = rho * cut.share * cut.spread
-        return cls(J, *found, noise, rho, biased=estimator == "ols", ratio=cut.ratio, curved=cut.curved)
+        return cls(J, *found, noise, rho, biased=estimator == "ols", turn=cut.turn, curved=cut.curved)
 
     def clean(self, denoise):
         """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""
@@ -251,10 +259,21 @@ class Solved:
         return (S[:n] * x / S[n])[:, None]
 
     def solution_noise(self, columns: ColumnSet, sampling: Sampling, solution):
-        """As the function of this name; a cut window's ratios are those of the pairs of columns themselves."""
-        n, whole = len(self.P), noise_ratio(sampling, columns, solution)[0]
-        more = self.J[:n, :n] * whole * (self.ratio - 1.0)
-        return solution_noise(self.J, columns, sampling, solution) + more
+        """As the function of this name. Of a cut window, centred squares of x and y are turned as they are; others as
+        in a whole one."""
+        found = solution_noise(self.J, columns, sampling, solution)
+        if self.turn is None:
+            return found
+        n, K = len(self.P), noise_ratio(sampling, columns, solution)[0]
+        powers = [c.terms[0].exponents[:2] for c in columns.columns[:n]]
+        square = np.array([max(e) > 1 for e in powers])
+        pixels = np.array([
+            [pixel_factor(sampling.x, p[0], q[0]) * pixel_factor(sampling.y, p[1], q[1]) for q in powers]
+            for p in powers
+        ])  # fmt: skip
+        centred = np.where(square[:, None] | square, 0.0, found - self.J[:n, :n] * K)
+        turned = self.turn @ self.J[:n, :n] @ self.turn.T
+        return turned * K * pixel_factor(sampling.x, 0, 0) * pixel_factor(sampling.y, 0, 0) / pixels + centred
 
     def covariances(self, columns: ColumnSet, sampling: Sampling, denoise):
         """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions."""

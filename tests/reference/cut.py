@@ -7,21 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from reference import cells, chain
 
-from leafflow_ti.kernels.cut import UNLIKE
 from leafflow_ti.models import ColumnSet
 from leafflow_ti.sampling import Sampling, pixel_factor
 
 
 @dataclass(frozen=True)
 class Cut:
-    """``noise`` [N, N]: covariance of the columns' noise; ``share`` of the window that is seen; ``spread`` and
-    ``ratio`` [n_flow, n_flow]: of the moments of w² and w, relative to those of the whole window, and to the former;
-    ``curved`` [3, 3]: x², xy, y² (columns) projected on 1, x, y."""
+    """``noise`` [N, N]: covariance of the columns' noise; ``share`` of the window that is seen; ``spread``: the ratio
+    of the sums of w² and w, relative to that of the whole window; ``turn`` [n_flow, n_flow]: B with ``B J_ff B^T`` the
+    sum over w² where the texture is the same everywhere, per that ratio; ``curved`` [3, 3]: x², xy, y² (columns) projected on 1, x, y."""
 
     noise: np.ndarray
     share: float
     spread: float
-    ratio: np.ndarray
+    turn: np.ndarray
     curved: np.ndarray
 
     @classmethod
@@ -34,25 +33,31 @@ class Cut:
             np.einsum("atuvyx,btuvyx,tuvyx->ab", g, g, weights, optimize=True)
             for g in cells.noise_vectors(sampling, columns)
         )
-        powers = [c.terms[0].exponents[:2] for c in columns.columns[: columns.n_flow]]
-
-        def moment(w, one, two):
-            return float(np.sum(w * grids["x"] ** (one[0] + two[0]) * grids["y"] ** (one[1] + two[1])))
-
-        def ratio(one, two):
-            plain, double = (
-                (moment(w, one, one) * moment(w, two, two)) ** 0.5 for w in (weights, squared)
-            )
-            alike, alike_squared = moment(weights, one, two) / plain, moment(squared, one, two) / double
-            found = double / plain * (alike * alike_squared + UNLIKE) / (alike**2 + UNLIKE)
-            return found / (pixel_factor(sampling.x, one[0], two[0]) * pixel_factor(sampling.y, one[1], two[1]))
-
-        spread = ratio((0, 0), (0, 0))
+        flow = columns.columns[: columns.n_flow]
+        shapes = [shape_values(c, grids) for c in flow]
+        distinct = [np.ones(shape), *shapes]
+        order = [0, *(1 + i for i, s in enumerate(shapes) if not any(np.array_equal(s, o) for o in distinct[: 1 + i]))]
+        W, W2 = (np.array([[np.sum(w * distinct[i] * distinct[j]) for j in order] for i in order])
+                 for w in (weights, squared))  # fmt: skip
+        X = np.linalg.inv(np.linalg.cholesky(W)).T @ np.linalg.cholesky(W2).T
+        B = np.zeros((len(flow), len(flow)))
+        for i, one in enumerate(flow):
+            for j, two in enumerate(flow):
+                if (one.channel, one.terms[0].exponents[2:]) == (two.channel, two.terms[0].exponents[2:]):
+                    a, b = (next(k for k, o in enumerate(order) if np.array_equal(distinct[o], shapes[n])) for n in (i, j))
+                    B[i, j] = X[b, a] / X[0, 0]
         affine = all(columns.index("x", a) is not None for a in "xy")
-        return cls(
-            noise, float(weights.sum()), spread, np.array([[ratio(a, b) for b in powers] for a in powers]) / spread,
-            curved(grids, weights, affine),
-        )  # fmt: skip
+        whole = pixel_factor(sampling.x, 0, 0) * pixel_factor(sampling.y, 0, 0)
+        return cls(noise, float(weights.sum()), X[0, 0] ** 2 / whole, B, curved(grids, weights, affine))
+
+
+def shape_values(column, grids):
+    """What a column depends on x and y by, at every sample."""
+    others = column.terms[0].exponents[2:]
+    return sum(
+        t.factor * grids["x"] ** t.exponents[0] * grids["y"] ** t.exponents[1]
+        for t in column.terms if t.exponents[2:] == others
+    )  # fmt: skip
 
 
 def _squared(sampling: Sampling):

@@ -77,14 +77,9 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved=None):
 
     def row(k, o):
         r = np.zeros(10)
-        seen = np.zeros(10)
-        if curved is not None and o in ("1", "x", "y"):
-            for f_, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
-                half = 0.5 if i == j else 1.0
-                seen += half * curved["1xy".index(o), f_] * second_derivative(x0, y0, f, (Z0, ZX, ZY), k, i, j)
         if o == "1":
             r[:3] = -nu * e[k]
-            return r + seen
+            return r
         r[:3] = -b[o] * e[k]
         if (o, k) in (("x", 0), ("y", 1)):
             r[2] += nu / f
@@ -93,14 +88,22 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved=None):
         r[9] = -nu * e[k] @ delta[o]
         if o == "t":
             r[6:9] = -nu * e[k]
-        return r + seen
+        return r
+
+    def projected(k, o):
+        # Along s nothing is bent: what is seen there is the derivative of the flow alone.
+        found = np.zeros(10)
+        for column, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+            half = 0.5 if i == j else 1.0
+            found += half * curved["1xy".index(o), column] * second_derivative(x0, y0, f, (Z0, ZX, ZY), k, i, j)
+        return found
 
     def measured(k, o):
         if o == "sx":
             return baseline[0] * row(k, "sx") + shift[0] * row(k, "x")
         if o == "sy":
             return baseline[1] * row(k, "sy") + shift[1] * row(k, "y")
-        return row(k, o)
+        return row(k, o) if curved is None or o == "t" else row(k, o) + projected(k, o)
 
     return np.array([measured(k, o) for k in (0, 1) for o in offsets])
 
