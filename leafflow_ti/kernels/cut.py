@@ -144,7 +144,7 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
     def curved(
         cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
     ):
-        """CURVED: x², xy, y² projected on 1, x, y over the window."""
+        """CURVED: x², xy, y² projected on 1, x, y over the window; CENTROID: of the window."""
         mask, factor = region(p, number, Region.MASK), region(p, number, Region.CURVED_FACTOR)
         target, basis = region(p, number, Region.CURVED), number[p.n + Number.CURVED_BASIS]
         small.clear(ws, target, 9, p.stride)
@@ -163,6 +163,9 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
                 ws[target + (3 * r + f) * p.stride] = ws[mask + at * p.stride]
         small.cholesky(ws, factor, basis, -1, p.stride)
         small.solve(ws, factor, target, basis, 3, p.stride)
+        for k in range(2):
+            mean = ws[mask + (1 + k) * p.stride] / ti.max(ws[mask], V(1e-30))
+            ws[region(p, number, Region.CENTROID) + k * p.stride] = ti.select(cut, mean, V(0.0))
         for e in range(9):
             whole = precise(0.0)
             if e == 0 or e == 2:

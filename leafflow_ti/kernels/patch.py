@@ -4,7 +4,8 @@ Schuchert 2010, Eqs. (5.8), (5.18), (5.23) with the errata of the model contract
 and preshifted data measure ``b a_s + nu0 a_x`` along a camera axis. The patch moves as ``U = N + Ω × P + ε P``. The
 window's affine fit sees the mean of what it leaves out: on a plane the flow is quadratic in x, y, with the second-order
 part ``(q1 x² + q2 xy, q1 xy + q2 y²)``, and q times the window's second moment belongs to the row of the flow itself;
-in a cut window the part's projection on 1, x, y belongs to the rows of the flow and of its derivatives along x, y.
+in a cut window the part's projection on 1, x, y belongs to the rows of the flow and of its derivatives along x, y, and
+derivatives along camera and time axes are those at the centroid of what is seen.
 """
 
 import functools
@@ -82,6 +83,21 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         ws[patch + Patch.INVERSE_C * p.stride] = 1.0 / (1.0 - ZX * x - ZY * y)
 
     @ti.func
+    def centroid(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """The centroid of a cut window from the pixel, in x/f and y/f; the depth here per depth there; and where the
+        patch is there, from its point [mm]. Of a whole window 0, 0, 1, and 0."""
+        patch, stride, at = region(p, number, Region.PATCH), p.stride, region(p, number, Region.CENTROID)
+        dx, dy = ws[at] * (1.0 / value[p.v + Value.F]), ws[at + stride] * (1.0 / value[p.v + Value.F])
+        ZX, ZY = ws[patch + Patch.SLOPE_X * stride], ws[patch + Patch.SLOPE_Y * stride]
+        nearer = 1.0 - (ZX * dx + ZY * dy) * ws[patch + Patch.INVERSE_C * stride]
+        depth = ws[patch + Patch.DEPTH * stride]
+        there = depth * (1.0 / nearer)
+        P2 = there - depth
+        P0 = P2 * ws[patch + Patch.X * stride] + there * dx
+        P1 = P2 * ws[patch + Patch.Y * stride] + there * dy
+        return dx, dy, nearer, P0, P1, P2
+
+    @ti.func
     def motion_row(
         k: ti.i32, code: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
     ):
@@ -99,12 +115,24 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         inverse, inverse_c = ws[patch + Patch.INVERSE_DEPTH * stride], ws[patch + Patch.INVERSE_C * stride]
         ZX, ZY = ws[patch + Patch.SLOPE_X * stride], ws[patch + Patch.SLOPE_Y * stride]
         N0, N1, N2 = ws[motion], ws[motion + stride], ws[motion + 2 * stride]
+        depth, cut = ws[patch + Patch.DEPTH * stride], texture.any_cut(p, number, ws)
+        P0, P1, P2 = V(0.0), V(0.0), V(0.0)
+        if cut == 1 and code > 2:
+            dx, dy, nearer, P0_, P1_, P2_ = centroid(p, number, value, ws)
+            x, y, inverse, farther = x + dx, y + dy, inverse * nearer, 1.0 / nearer
+            inverse_c, depth = inverse_c * farther, depth * farther
+            P0, P1, P2 = P0_, P1_, P2_
+            O0, O1, O2 = ws[motion + 3 * stride], ws[motion + 4 * stride], ws[motion + 5 * stride]
+            growth = ws[motion + GROWTH * stride]
+            N0 = N0 + O1 * P2 - O2 * P1 + growth * P0
+            N1 = N1 + O2 * P0 - O0 * P2 + growth * P1
+            N2 = N2 + O0 * P1 - O1 * P0 + growth * P2
         # e_k = (1, 0, -x) or (0, 1, -y)
         second = ti.cast(k, precise)
         first = 1.0 - second
         along = 0.0 - (x * first + y * second)
         n0, n1, n2, r0, r1, r2, grown = V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)
-        scale, cut = V(0.0), texture.any_cut(p, number, ws)
+        scale = V(0.0)
         along_s = code == 3 or code == 4
         for part in range(ti.select(along_s, 2, 1)):
             axis, factor = code, f
@@ -132,7 +160,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
                 if axis == 2 or axis == 4:
                     slope = ZY
                 if axis < 3:
-                    h = ws[patch + Patch.DEPTH * stride] * wide
+                    h = depth * wide
                 if axis == 5:
                     slope = N2 - ZX * N0 - ZY * N1
                 d2 = h * slope * inverse_c
@@ -174,6 +202,13 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
                     else:
                         r0 = r0 - turned
                     grown = grown - bent
+        if cut == 1 and code > 2:
+            # Of the motion of the patch, not of its point there.
+            r0 = r0 + P1 * n2 - P2 * n1
+            r1 = r1 + P2 * n0 - P0 * n2
+            r2 = r2 + P0 * n1 - P1 * n0
+            grown = grown + P0 * n0 + P1 * n1 + P2 * n2
+            N0, N1, N2 = ws[motion], ws[motion + stride], ws[motion + 2 * stride]
         row = region(p, number, Region.ROW)
         ws[row] = n0
         ws[row + stride] = n1
@@ -198,9 +233,20 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         small.clear(ws, row, MAX_UNKNOWNS, stride)
         inverse = ws[patch + Patch.INVERSE_DEPTH * stride]
         scale = inverse * inverse * ws[patch + Patch.INVERSE_C * stride] * value[p.v + Value.F]
-        ws[row] = 0.0 - scale * ws[patch + Patch.SLOPE_X * stride]
-        ws[row + stride] = 0.0 - scale * ws[patch + Patch.SLOPE_Y * stride]
+        terms = 3
+        P0, P1, P2 = V(0.0), V(0.0), V(0.0)
+        if texture.any_cut(p, number, ws) == 1:
+            _dx, _dy, nearer, P0_, P1_, P2_ = centroid(p, number, value, ws)
+            scale, P0, P1, P2, terms = scale * nearer, P0_, P1_, P2_, 6
+        n0 = 0.0 - scale * ws[patch + Patch.SLOPE_X * stride]
+        n1 = 0.0 - scale * ws[patch + Patch.SLOPE_Y * stride]
+        ws[row] = n0
+        ws[row + stride] = n1
         ws[row + 2 * stride] = scale
-        return small.dot(ws, row, 1, region(p, number, Region.MOTION), 1, 3, stride)
+        # Growth moves points within the plane: nothing of it is seen.
+        ws[row + 3 * stride] = P1 * scale - P2 * n1
+        ws[row + 4 * stride] = P2 * n0 - P0 * scale
+        ws[row + 5 * stride] = P0 * n1 - P1 * n0
+        return small.dot(ws, row, 1, region(p, number, Region.MOTION), 1, terms, stride)
 
     return SimpleNamespace(pixel_ray=pixel_ray, place_patch=place_patch, motion_row=motion_row, range_row=range_row)

@@ -80,12 +80,13 @@ class Region(IntEnum):
     WEIGHT_NOISE = auto()  # packed [N]: Σ w ω C, as the tensor now is; of the fundamental scheme what it takes off
     NOISE_FACTOR = auto()  # packed [N]: its factor, scaled; these two empty unless windows are cut or weighted anew
     SPREAD = auto()  # [1]: what mask or weights make of the variance of the normal equations' noise
-    MASK = auto()  # [planes]: moments of the valid part of the window; these and the next five empty unless cut
+    MASK = auto()  # [planes]: moments of the valid part of the window; these and the next six empty unless cut
     CUT_PRODUCTS = auto()  # packed [shapes]: the shapes' products over the window, then their factor
     CUT_SQUARED = auto()  # packed [shapes]: the same with the squared weights
     CUT_SHAPE = auto()  # [shapes, shapes]: what leads from the former to the latter
     CURVED = auto()  # [3, 3]: x², xy, y² projected on 1, x, y
     CURVED_FACTOR = auto()  # packed [3]
+    CENTROID = auto()  # [2]: of what is seen, px from the pixel; 0 where the window is whole
     SHARE = auto()  # [1]: mean weight; from here on: empty unless windows are weighted anew
     SCALE_SQUARED = auto()  # [1]: σ² of the penalty
     LEAST_SQUARED = auto()  # [1]: the least that it may become
@@ -200,6 +201,7 @@ class Layout:
             Region.CUT_SHAPE: self.shapes**2,
             Region.CURVED: 9 * cut,
             Region.CURVED_FACTOR: 6 * cut,
+            Region.CENTROID: 2 * cut,
             Region.SHARE: anew,
             Region.SCALE_SQUARED: anew,
             Region.LEAST_SQUARED: anew,

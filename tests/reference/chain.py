@@ -214,7 +214,7 @@ class Solved:
     ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
     the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
     ``support``: mean weight where the window was weighted anew, at most 1; ``biased``: by the noise of all columns but
-    the time-like ones, towards 0. Of a window that is cut also ``turn`` and ``curved`` of ``cut.Cut``.
+    the time-like ones, towards 0. Of a window that is cut also ``turn``, ``curved`` and ``centroid`` of ``cut.Cut``.
     """
 
     J: np.ndarray
@@ -226,6 +226,7 @@ class Solved:
     biased: bool = False
     turn: np.ndarray | None = None
     curved: np.ndarray | None = None
+    centroid: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0, cut=None):
@@ -238,7 +239,7 @@ class Solved:
         if cut is None:
             return cls(J, *found, noise, rho, biased=estimator == "ols")
         rho = rho * cut.share * cut.spread
-        return cls(J, *found, noise, rho, biased=estimator == "ols", turn=cut.turn, curved=cut.curved)
+        return cls(J, *found, noise, rho, biased=estimator == "ols", turn=cut.turn, curved=cut.curved, centroid=cut.centroid)
 
     def clean(self, denoise):
         """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""

@@ -15,13 +15,15 @@ from leafflow_ti.sampling import Sampling, pixel_factor
 class Cut:
     """``noise`` [N, N]: covariance of the columns' noise; ``share`` of the window that is seen; ``spread``: the ratio
     of the sums of w² and w, relative to that of the whole window; ``turn`` [n_flow, n_flow]: B with ``B J_ff B^T`` the
-    sum over w² where the texture is the same everywhere, per that ratio; ``curved`` [3, 3]: x², xy, y² (columns) projected on 1, x, y."""
+    sum over w² where the texture is the same everywhere, per that ratio; ``curved`` [3, 3]: x², xy, y² (columns) projected on 1, x, y; ``centroid`` (x, y)
+    px from the pixel."""
 
     noise: np.ndarray
     share: float
     spread: float
     turn: np.ndarray
     curved: np.ndarray
+    centroid: tuple[float, float]
 
     @classmethod
     def of(cls, seen, sampling: Sampling, columns: ColumnSet) -> Cut:
@@ -48,7 +50,8 @@ class Cut:
                     B[i, j] = X[b, a] / X[0, 0]
         affine = all(columns.index("x", a) is not None for a in "xy")
         whole = pixel_factor(sampling.x, 0, 0) * pixel_factor(sampling.y, 0, 0)
-        return cls(noise, float(weights.sum()), X[0, 0] ** 2 / whole, B, curved(grids, weights, affine))
+        centroid = tuple(float(np.sum(weights * grids[a]) / weights.sum()) for a in "xy")
+        return cls(noise, float(weights.sum()), X[0, 0] ** 2 / whole, B, curved(grids, weights, affine), centroid)
 
 
 def shape_values(column, grids):

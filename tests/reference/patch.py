@@ -46,13 +46,20 @@ def surface(x0, y0, f, nu, b1=0.0, b2=0.0):
     return Z0, c * p, c * q, c
 
 
-def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved=None):
+def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved=None, centroid=(0.0, 0.0)):
     """Design [rows, 10] by (N, Ω, A, ε) of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
 
     Rows run over the directions, then the offsets. The s-offsets are per camera step at the preshifted pixel.
     ``curved`` [3, 3]: projections of x², xy, y² (columns) on 1, x, y over the window, by which these rows see the
-    flow's second-order part.
+    flow's second-order part. ``centroid`` (x, y): of what the window sees, from the pixel; derivatives along s and t
+    are those there.
     """
+    if np.any(centroid):
+        x, y, plane, there, P = moved(x0, y0, f, geometry, q, centroid)
+        here = motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved)
+        away = about_point(motion_rows(x, y, f, plane, offsets, there, shift, baseline), P)
+        far = np.array([o in ("sx", "sy", "t") for _ in (0, 1) for o in offsets])
+        return np.where(far[:, None], away, here)
     nu, b1, b2 = geometry
     Z0, ZX, ZY, c = surface(x0, y0, f, nu, b1, b2)
     N = np.zeros(3)
@@ -128,8 +135,32 @@ def second_derivative(x0, y0, f, plane, k, i, j):
     return np.array(found) / (4 * h**2)
 
 
-def range_row(x0, y0, f, geometry):
-    """Design [10] of the range constraint for b_t (5.23)."""
+def moved(x0, y0, f, geometry, q, by):
+    """Pixel, geometry and motion where the patch is seen ``by`` (x, y) px further; P from its point to there."""
+    nu, b1, b2 = geometry
+    x, y = x0 + by[0], y0 + by[1]
+    there = (nu + b1 * by[0] + b2 * by[1], b1, b2)
+    P = -f / there[0] * np.array([x / f, y / f, 1.0]) + f / nu * np.array([x0 / f, y0 / f, 1.0])
+    motion = np.array(q, float)
+    motion[:3] += np.cross(q[3:6], P) + q[9] * P
+    return x, y, there, motion, P
+
+
+def about_point(rows, P):
+    """Design [rows, 10] by the motion of the patch from that by the motion of its part at P."""
+    rows = rows.copy()
+    rows[:, 3:6] += np.cross(P, rows[:, :3])
+    rows[:, 9] += rows[:, :3] @ P
+    return rows
+
+
+def range_row(x0, y0, f, geometry, centroid=(0.0, 0.0)):
+    """Design [10] of the range constraint for b_t (5.23), which is that at the centroid of what is seen."""
+    if np.any(centroid):
+        x, y, there, _, P = moved(x0, y0, f, geometry, np.zeros(10), centroid)
+        row = about_point(range_row(x, y, f, there)[None], P)[0]
+        row[9] = 0.0  # growth moves points within the plane
+        return row
     Z0, ZX, ZY, c = surface(x0, y0, f, *geometry)
     r = np.zeros(10)
     r[:3] = f / (Z0**2 * c) * np.array([-ZX, -ZY, 1.0])
@@ -137,12 +168,12 @@ def range_row(x0, y0, f, geometry):
 
 
 def seen_of(solved, sampling):
-    """``curved`` of ``motion_rows`` for a solution; of a whole window its second moments."""
+    """``curved`` and ``centroid`` of ``motion_rows`` for a solution; of a whole window its second moments."""
     if solved.curved is not None:
-        return solved.curved
+        return solved.curved, solved.centroid
     whole = np.zeros((3, 3))
     whole[0, 0], whole[0, 2] = sampling.x.moment(2), sampling.y.moment(2)
-    return whole
+    return whole, solved.centroid
 
 
 def shared_covariance(found_own, P_inverse, own_inverse, columns, own_columns, sampling, own_sampling, step):
@@ -227,8 +258,8 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
             codes.append("range")
 
         def design(geometry, q):
-            A = motion_rows(x0, y0, f, geometry, problem.offsets, q, shift, baseline, seen_of(solved, sampling))
-            return np.vstack([A, range_row(x0, y0, f, geometry)]) if problem.use_range else A
+            A = motion_rows(x0, y0, f, geometry, problem.offsets, q, shift, baseline, *seen_of(solved, sampling))
+            return np.vstack([A, range_row(x0, y0, f, geometry, solved.centroid)]) if problem.use_range else A
 
         return rows_of(value, C, shared, design, codes, problem.use_range, q), rows
 
@@ -250,7 +281,7 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
             Z0, ZX, ZY, _ = surface(x0, y0, f, *geometry)
             c = 1 - ZX * x / f - ZY * y / f
             there = (-f / Z0, ZX / (Z0 * c), ZY / (Z0 * c))
-            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, seen_of(found_own, sampling))
+            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, *seen_of(found_own, sampling))
 
         codes = [*flows.offsets, *flows.offsets]
         found = rows_of(E @ p[:, 0], E @ C @ E.T, np.zeros((len(g), len(rows))), design, codes, False, q)
