@@ -35,15 +35,17 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
         flow = number[p.n + Number.FLOW]
         moments, packed = region(p, number, Region.MOMENTS), region(p, number, Region.CLEAN)
         quietest = identify.quietest(p, number, ws)
-        own = ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
-        some, floor = small.any_lane(own), V(0.0)
+        floor = V(0.0)
         for r in range(flow):
             for c in range(r + 1):
                 s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride] * s
                 noise = V(ti.select(r == c, value[p.v + Value.NOISE + r], precise(0.0)))
-                if some == 1:
-                    noise = ti.select(own, ws[region(p, number, Region.WEIGHT_NOISE) + tri(r, c) * p.stride], noise)
+                own = region(p, number, Region.WEIGHT_NOISE) + tri(r, c) * p.stride
+                if ti.static(spec.cut):
+                    noise = ti.select(ws[region(p, number, Region.CUT)] > V(0.5), ws[own], noise)
+                elif number[p.n + Number.REWEIGHTED] == 1:
+                    noise = ws[own]
                 if r == c:
                     floor = floor + element * value[p.v + Value.RIDGE]
                 element = element - quietest * noise * (value[p.v + Value.DENOISE] * s)
@@ -95,7 +97,7 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
         if p.which == number[p.n + Number.MOTION_SOLUTION]:
             n_rows, rows_at = number[p.n + Number.ROWS_T], ti.cast(Number.MOTION_ROWS, ti.i32)
             target, cov = region(p, number, Region.RESPONSE_T), region(p, number, Region.COV_T)
-        moments, cut = region(p, number, Region.MOMENTS), texture.any_cut(p, number, ws)
+        moments = region(p, number, Region.MOMENTS)
         noise, product = region(p, number, Region.NOISE), region(p, number, Region.PRODUCT)
         size = flow * (flow + 1) // 2
         for r in range(flow):
@@ -104,18 +106,18 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
                 ratio = value[p.v + Value.RATIO + p.which * size + tri(r, c)]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride]
                 ws[noise + tri(r, c) * p.stride] = element * (s * ratio)
-        if cut == 1:
-            windows.equation_noise(noise, p, number, value, ws)
+        if ti.static(spec.cut):
+            if texture.any_cut(p, number, ws) == 1:
+                windows.equation_noise(noise, p, number, value, ws)
         terms = number[p.n + Number.NOISE_TERMS]
         extra = Value.RATIO + number[p.n + Number.SOLUTIONS] * size + p.which * terms
         for term in range(terms):
             at = p.n + Number.LOWER + tri(number[p.n + Number.N], 0) + 2 * term
             own = noise + number[at] * p.stride
             share = ws[moments + number[at + 1] * p.stride] * value[p.v + extra + term]
-            if cut == 1:
+            if ti.static(spec.cut):
                 if windows.of_image_square(term, p, number) == 1:
-                    whole = ws[region(p, number, Region.OWN_NOISE)] < V(0.5)
-                    share = ti.select(whole, share, V(0.0))
+                    share = ti.select(ws[region(p, number, Region.CUT)] > V(0.5), V(0.0), share)
             ws[own] = ws[own] + share
         response(target, rows_at, n_rows, p, number, value, ws)
         small.symmetric_times(ws, noise, target, product, flow, n_rows, p.stride)

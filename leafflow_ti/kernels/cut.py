@@ -106,7 +106,7 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
         whole += number[p.n + Number.CUT_PRODUCTS] + 1
         moments, turn = region(p, number, Region.MOMENTS), region(p, number, Region.CUT_SHAPE)
         ratios = p.v + Value.RATIO + p.which * tri(flow, 0)
-        cut = ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
+        cut = ws[region(p, number, Region.CUT)] > V(0.5)
         for part in range(2):
             for r in range(flow):
                 for c in range(ti.select(part == 0, flow, r + 1)):
@@ -179,8 +179,8 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
         out: ti.template(),
     ):  # fmt: skip
         """Noise, ratios and projection of cut windows; from here on these alone are active."""
-        cut = ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
-        ws[region(p, number, Region.ACTIVE)] = ws[region(p, number, Region.OWN_NOISE)]
+        cut = ws[region(p, number, Region.CUT)] > V(0.5)
+        ws[region(p, number, Region.ACTIVE)] = ws[region(p, number, Region.CUT)]
         if small.any_lane(cut) == 1:
             load_moments(p, number, ws, J)
             noise(cut, p, number, value, ws)

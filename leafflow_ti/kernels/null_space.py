@@ -13,6 +13,7 @@ from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.identify import identify_functions
 from leafflow_ti.kernels.spec import EXTRA_PLANES, KernelSpec
+from leafflow_ti.kernels.texture import texture_functions
 from leafflow_ti.kernels.workspace import Number, Region, Value
 
 JACOBI_SWEEPS = 16
@@ -28,7 +29,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     ``parameters``, ``residuals`` and ``centre``; and what stages of weighted windows share with them: ``keep``,
     ``left_out``, ``unsolved``."""
     precise, lanes, V = spec.precise, spec.lanes, spec.element
-    small, identify = dense(spec), identify_functions(spec)
+    small, identify, texture = dense(spec), identify_functions(spec), texture_functions(spec)
 
     @ti.func
     def load(
@@ -49,12 +50,10 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
             ws[moments + k * p.stride] = element
         ws[region(p, number, Region.CONVERGED)] = V(0.0)
         ws[region(p, number, Region.ACTIVE)] = V(1.0)
-        own = V(ti.cast(number[p.n + Number.REWEIGHTED], precise))
-        if number[p.n + Number.MASK_PLANES] > 0:
+        if ti.static(spec.cut):
             mass = ws[moments + number[p.n + Number.EXTRA] * p.stride]
             cut = (mass < V(WHOLE)) & (mass >= V(value[p.v + Value.MIN_MASS]))
-            own = ti.select(cut, V(1.0), V(0.0))
-        ws[region(p, number, Region.OWN_NOISE)] = own
+            ws[region(p, number, Region.CUT)] = ti.select(cut, V(1.0), V(0.0))
 
     @ti.func
     def left_out(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
@@ -299,7 +298,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
         """Image noise variance ``p^T J p / p^T C p`` that the residual of each solution amounts to."""
         n, k, flow = number[p.n + Number.N], number[p.n + Number.SOLUTIONS], number[p.n + Number.FLOW]
         vectors, images = region(p, number, Region.VECTORS), region(p, number, Region.IMAGES)
-        found, anew = region(p, number, Region.PARAMETERS), ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
+        found = region(p, number, Region.PARAMETERS)
         for j in range(k):
             norm = V(0.0)
             for r in range(n):
@@ -309,8 +308,12 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                     element = ws[found + (j * flow + r) * p.stride] * unit
                 norm = norm + element * element * (value[p.v + Value.NOISE + r] / (unit * unit))
                 ws[vectors + (r * k + j) * p.stride] = element
-            if small.any_lane(anew) == 1:
-                norm = ti.select(anew, weighted_noise(j, k, p, number, value, ws), norm)
+            if ti.static(spec.cut):
+                if texture.any_cut(p, number, ws) == 1:
+                    cut = ws[region(p, number, Region.CUT)] > V(0.5)
+                    norm = ti.select(cut, weighted_noise(j, k, p, number, value, ws), norm)
+            elif number[p.n + Number.REWEIGHTED] == 1:
+                norm = weighted_noise(j, k, p, number, value, ws)
             ws[region(p, number, Region.VARIANCE) + j * p.stride] = norm
         small.upper_times(ws, region(p, number, Region.TENSOR), vectors, images, n, k, p.stride)
         for j in range(k):
@@ -326,15 +329,16 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     ):
         """``S σ² N_ff p``: what noise adds to J_ff, times solution j, whose scaled entries are in VECTORS."""
         flow, noise = number[p.n + Number.FLOW], region(p, number, Region.WEIGHT_NOISE)
-        own = ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
-        some = small.any_lane(own)
         vectors, variance = region(p, number, Region.VECTORS), ws[region(p, number, Region.VARIANCE) + j * p.stride]
         for r in range(flow):
             total = V(0.0)
             for c in range(flow):
                 element = V(ti.select(r == c, value[p.v + Value.NOISE + r], precise(0.0)))
-                if some == 1:
-                    element = ti.select(own, ws[noise + tri(ti.max(r, c), ti.min(r, c)) * p.stride], element)
+                here = noise + tri(ti.max(r, c), ti.min(r, c)) * p.stride
+                if ti.static(spec.cut):
+                    element = ti.select(ws[region(p, number, Region.CUT)] > V(0.5), ws[here], element)
+                elif number[p.n + Number.REWEIGHTED] == 1:
+                    element = ws[here]
                 total = total + element * ws[vectors + (c * k + j) * p.stride] * value[p.v + Value.SCALE + c]
             at = region(p, number, Region.BIAS) + (j * flow + r) * p.stride
             ws[at] = total * variance * value[p.v + Value.SCALE + r]

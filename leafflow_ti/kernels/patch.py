@@ -2,10 +2,8 @@
 
 Schuchert 2010, Eqs. (5.8), (5.18), (5.23) with the errata of the model contract: the time column uses ``∂X/∂t - N``,
 and preshifted data measure ``b a_s + nu0 a_x`` along a camera axis. The patch moves as ``U = N + Ω × P + ε P``. The
-window's affine fit sees the mean of what it leaves out: on a plane the flow is quadratic in x, y, with the second-order
-part ``(q1 x² + q2 xy, q1 xy + q2 y²)``, and q times the window's second moment belongs to the row of the flow itself;
-in a cut window the part's projection on 1, x, y belongs to the rows of the flow and of its derivatives along x, y, and
-derivatives along camera and time axes are those at the centroid of what is seen.
+window's affine fit sees the mean of what it leaves out: on a plane the flow is quadratic in x, y, and its second-order
+part times the window's second moment belongs to the row of the flow itself.
 """
 
 import functools
@@ -16,7 +14,6 @@ from leafflow_ti.kernels.dense import dense
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.spec import KernelSpec
-from leafflow_ti.kernels.texture import texture_functions
 from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, PATCH_SIZE, Number, Region, Value
 
 RANGE_CODE = 6
@@ -46,7 +43,7 @@ assert len(Patch) <= PATCH_SIZE
 def patch_functions(spec: KernelSpec) -> SimpleNamespace:
     """``pixel_ray``, ``place_patch``, and ``motion_row``, ``range_row``, which leave an equation in ``Region.ROW``."""
     precise, lanes, V = spec.precise, spec.lanes, spec.element
-    small, texture = dense(spec), texture_functions(spec)
+    small = dense(spec)
 
     @ti.func
     def pixel_ray(p: ti.template(), number: ti.template(), value: ti.template()):
@@ -83,21 +80,6 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         ws[patch + Patch.INVERSE_C * p.stride] = 1.0 / (1.0 - ZX * x - ZY * y)
 
     @ti.func
-    def centroid(p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
-        """The centroid of a cut window from the pixel, in x/f and y/f; the depth here per depth there; and where the
-        patch is there, from its point [mm]. Of a whole window 0, 0, 1, and 0."""
-        patch, stride, at = region(p, number, Region.PATCH), p.stride, region(p, number, Region.CENTROID)
-        dx, dy = ws[at] * (1.0 / value[p.v + Value.F]), ws[at + stride] * (1.0 / value[p.v + Value.F])
-        ZX, ZY = ws[patch + Patch.SLOPE_X * stride], ws[patch + Patch.SLOPE_Y * stride]
-        nearer = 1.0 - (ZX * dx + ZY * dy) * ws[patch + Patch.INVERSE_C * stride]
-        depth = ws[patch + Patch.DEPTH * stride]
-        there = depth * (1.0 / nearer)
-        P2 = there - depth
-        P0 = P2 * ws[patch + Patch.X * stride] + there * dx
-        P1 = P2 * ws[patch + Patch.Y * stride] + there * dy
-        return dx, dy, nearer, P0, P1, P2
-
-    @ti.func
     def motion_row(
         k: ti.i32, code: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
     ):
@@ -115,18 +97,6 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         inverse, inverse_c = ws[patch + Patch.INVERSE_DEPTH * stride], ws[patch + Patch.INVERSE_C * stride]
         ZX, ZY = ws[patch + Patch.SLOPE_X * stride], ws[patch + Patch.SLOPE_Y * stride]
         N0, N1, N2 = ws[motion], ws[motion + stride], ws[motion + 2 * stride]
-        depth, cut = ws[patch + Patch.DEPTH * stride], texture.any_cut(p, number, ws)
-        P0, P1, P2 = V(0.0), V(0.0), V(0.0)
-        if cut == 1 and code > 2:
-            dx, dy, nearer, P0_, P1_, P2_ = centroid(p, number, value, ws)
-            x, y, inverse, farther = x + dx, y + dy, inverse * nearer, 1.0 / nearer
-            inverse_c, depth = inverse_c * farther, depth * farther
-            P0, P1, P2 = P0_, P1_, P2_
-            O0, O1, O2 = ws[motion + 3 * stride], ws[motion + 4 * stride], ws[motion + 5 * stride]
-            growth = ws[motion + GROWTH * stride]
-            N0 = N0 + O1 * P2 - O2 * P1 + growth * P0
-            N1 = N1 + O2 * P0 - O0 * P2 + growth * P1
-            N2 = N2 + O0 * P1 - O1 * P0 + growth * P2
         # e_k = (1, 0, -x) or (0, 1, -y)
         second = ti.cast(k, precise)
         first = 1.0 - second
@@ -144,10 +114,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
                 # Half the second derivative of u_k along its own axis: -T_Z d(1/Z) + (Ω × e_Z)_k / f, where
                 # T = N - Ω × X0 - ε X0 is the velocity that the patch's motion has at the camera; along the other axis
                 # it vanishes.
-                turned = V(value[p.v + Value.SECOND_MOMENT + k])
-                if cut == 1:
-                    turned = ws[region(p, number, Region.CURVED) + 2 * k * stride]
-                turned = turned * wide
+                turned = value[p.v + Value.SECOND_MOMENT + k] * wide
                 bent = (ZX * first + ZY * second) * inverse_c * turned
                 n0 = scale * first
                 n1 = scale * second
@@ -160,7 +127,7 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
                 if axis == 2 or axis == 4:
                     slope = ZY
                 if axis < 3:
-                    h = depth * wide
+                    h = ws[patch + Patch.DEPTH * stride] * wide
                 if axis == 5:
                     slope = N2 - ZX * N0 - ZY * N1
                 d2 = h * slope * inverse_c
@@ -185,30 +152,6 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
                 r1 = r1 + scale * (d2 * first - d0 * along)
                 r2 = r2 + scale * (d0 * second - d1 * first)
                 grown = grown + scale * (d0 * first + d1 * second + d2 * along)
-        if cut == 1 and code < 3:
-            for axis in range(2):
-                if code > 0 or axis != k:
-                    moment = 3 * code + ti.select(axis == k, 2 * k, 1)
-                    turned = ws[region(p, number, Region.CURVED) + moment * stride] * wide
-                    slope = ZX
-                    if axis == 1:
-                        slope = ZY
-                    bent = slope * inverse_c * turned
-                    n2 = n2 + bent * inverse
-                    r0 = r0 - bent * y
-                    r1 = r1 + bent * x
-                    if axis == 0:
-                        r1 = r1 + turned
-                    else:
-                        r0 = r0 - turned
-                    grown = grown - bent
-        if cut == 1 and code > 2:
-            # Of the motion of the patch, not of its point there.
-            r0 = r0 + P1 * n2 - P2 * n1
-            r1 = r1 + P2 * n0 - P0 * n2
-            r2 = r2 + P0 * n1 - P1 * n0
-            grown = grown + P0 * n0 + P1 * n1 + P2 * n2
-            N0, N1, N2 = ws[motion], ws[motion + stride], ws[motion + 2 * stride]
         row = region(p, number, Region.ROW)
         ws[row] = n0
         ws[row + stride] = n1
@@ -233,20 +176,9 @@ def patch_functions(spec: KernelSpec) -> SimpleNamespace:
         small.clear(ws, row, MAX_UNKNOWNS, stride)
         inverse = ws[patch + Patch.INVERSE_DEPTH * stride]
         scale = inverse * inverse * ws[patch + Patch.INVERSE_C * stride] * value[p.v + Value.F]
-        terms = 3
-        P0, P1, P2 = V(0.0), V(0.0), V(0.0)
-        if texture.any_cut(p, number, ws) == 1:
-            _dx, _dy, nearer, P0_, P1_, P2_ = centroid(p, number, value, ws)
-            scale, P0, P1, P2, terms = scale * nearer, P0_, P1_, P2_, 6
-        n0 = 0.0 - scale * ws[patch + Patch.SLOPE_X * stride]
-        n1 = 0.0 - scale * ws[patch + Patch.SLOPE_Y * stride]
-        ws[row] = n0
-        ws[row + stride] = n1
+        ws[row] = 0.0 - scale * ws[patch + Patch.SLOPE_X * stride]
+        ws[row + stride] = 0.0 - scale * ws[patch + Patch.SLOPE_Y * stride]
         ws[row + 2 * stride] = scale
-        # Growth moves points within the plane: nothing of it is seen.
-        ws[row + 3 * stride] = P1 * scale - P2 * n1
-        ws[row + 4 * stride] = P2 * n0 - P0 * scale
-        ws[row + 5 * stride] = P0 * n1 - P1 * n0
-        return small.dot(ws, row, 1, region(p, number, Region.MOTION), 1, terms, stride)
+        return small.dot(ws, row, 1, region(p, number, Region.MOTION), 1, 3, stride)
 
     return SimpleNamespace(pixel_ray=pixel_ray, place_patch=place_patch, motion_row=motion_row, range_row=range_row)

@@ -22,11 +22,8 @@ def texture_functions(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def any_cut(p: ti.template(), number: ti.template(), ws: ti.template()) -> ti.i32:
-        """Whether a window of the group is cut, and what ``kernels.cut`` makes of that counts."""
-        found = 0
-        if number[p.n + Number.MASK_PLANES] > 0:
-            found = small.any_lane(ws[region(p, number, Region.OWN_NOISE)] > V(0.5))
-        return found
+        """Whether a window of the group is cut."""
+        return small.any_lane(ws[region(p, number, Region.CUT)] > V(0.5))
 
     @ti.func
     def smoothness(p: ti.template(), number: ti.template(), ws: ti.template()):
@@ -43,12 +40,12 @@ def texture_functions(spec: KernelSpec) -> SimpleNamespace:
         if number[p.n + Number.REWEIGHTED] == 1:
             # The same noise, by fewer or more unequal samples.
             share = share * ws[region(p, number, Region.SPREAD)]
-        elif any_cut(p, number, ws) == 1:
-            cut = ws[region(p, number, Region.OWN_NOISE)] > V(0.5)
-            whole = share / ti.max(seen, V(1e-6))
-            share = ti.select(cut, share * ws[region(p, number, Region.SPREAD)], whole)
         else:
-            share = share / ti.max(seen, V(1e-6))
+            whole = share / ti.max(seen, V(1e-6))
+            if ti.static(spec.cut):
+                cut = ws[region(p, number, Region.CUT)] > V(0.5)
+                whole = ti.select(cut, share * ws[region(p, number, Region.SPREAD)], whole)
+            share = whole
         return share
 
     @ti.func

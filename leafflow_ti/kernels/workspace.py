@@ -76,17 +76,18 @@ class Region(IntEnum):
     REFERENCE_VARIANCE = auto()  # [1]
     BIAS = auto()  # [k, F]: of the scaled normal equations, by the noise of their columns; empty without one
     ACTIVE = auto()  # [1]: 1 where a solution is wanted: once there is one, where the window is cut or weighted anew
-    OWN_NOISE = auto()  # [1]: 1 where WEIGHT_NOISE takes the place of C: the window is cut, or weighted anew
+    CUT = auto()  # [1]: 1 where the window is cut; WEIGHT_NOISE then takes the place of C
     WEIGHT_NOISE = auto()  # packed [N]: Σ w ω C, as the tensor now is; of the fundamental scheme what it takes off
     NOISE_FACTOR = auto()  # packed [N]: its factor, scaled; these two empty unless windows are cut or weighted anew
     SPREAD = auto()  # [1]: what mask or weights make of the variance of the normal equations' noise
-    MASK = auto()  # [planes]: moments of the valid part of the window; these and the next six empty unless cut
+    MASK = auto()  # [planes]: moments of the valid part of the window; these and the next seven empty unless cut
     CUT_PRODUCTS = auto()  # packed [shapes]: the shapes' products over the window, then their factor
     CUT_SQUARED = auto()  # packed [shapes]: the same with the squared weights
     CUT_SHAPE = auto()  # [shapes, shapes]: what leads from the former to the latter
     CURVED = auto()  # [3, 3]: x², xy, y² projected on 1, x, y
     CURVED_FACTOR = auto()  # packed [3]
     CENTROID = auto()  # [2]: of what is seen, px from the pixel; 0 where the window is whole
+    CUT_PATCH = auto()  # [11]: patch and velocity at the pixel while rows are made for the centroid (kernels.cut_rows)
     SHARE = auto()  # [1]: mean weight; from here on: empty unless windows are weighted anew
     SCALE_SQUARED = auto()  # [1]: σ² of the penalty
     LEAST_SQUARED = auto()  # [1]: the least that it may become
@@ -191,7 +192,7 @@ class Layout:
             Region.REFERENCE_VARIANCE: 1,
             Region.BIAS: k * flow * int(self.biased),
             Region.ACTIVE: 1,
-            Region.OWN_NOISE: 1,
+            Region.CUT: cut,
             Region.WEIGHT_NOISE: own * packed(n),
             Region.NOISE_FACTOR: own * packed(n),
             Region.SPREAD: own,
@@ -202,6 +203,7 @@ class Layout:
             Region.CURVED: 9 * cut,
             Region.CURVED_FACTOR: 6 * cut,
             Region.CENTROID: 2 * cut,
+            Region.CUT_PATCH: 11 * cut,
             Region.SHARE: anew,
             Region.SCALE_SQUARED: anew,
             Region.LEAST_SQUARED: anew,
@@ -259,7 +261,7 @@ class Number(IntEnum):
     STEP = auto()
     PITCH = auto()
     BIASED = auto()  # what the noise of the columns does to solutions counts among their errors
-    MASK_PLANES = auto()  # moments of the valid part of windows; 0: none is cut, and the next six mean nothing
+    MASK_PLANES = auto()  # moments of the valid part of windows; 0: none is cut, and the next seven mean nothing
     MASK_PLANE = auto()  # where they begin among the planes
     CURVED_BASIS = auto()  # 3: the flow's second-order part is projected on 1, x, y; 1: on 1
     SHAPES = auto()  # of columns by their offsets in x and y

@@ -155,7 +155,7 @@ class EstimateStage:
         """Kernel, first step, end, and part of what is launched for a batch."""
         from leafflow_ti.kernels.stages import stage_kernel, stages_kernel
 
-        spec, steps = self.device.dense, self._steps
+        spec, steps = replace(self.device.dense, cut=self._tables.layout.mask > 0), self._steps
         if self.device.gpu:
             return [(stage_kernel(spec, Stage(s.stage)), i, i + 1, s.part) for i, s in enumerate(steps)]
         kernel = stages_kernel(spec, Stage(max(s.stage for s in steps)))
