@@ -106,7 +106,7 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
                 ratio = value[p.v + Value.RATIO + p.which * size + tri(r, c)]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride]
                 ws[noise + tri(r, c) * p.stride] = element * (s * ratio)
-        if ti.static(spec.cut):
+        if ti.static(spec.cut):  # noqa: SIM102 - the engine decides the one before it compiles the other
             if texture.any_cut(p, number, ws) == 1:
                 windows.equation_noise(noise, p, number, value, ws)
         terms = number[p.n + Number.NOISE_TERMS]
@@ -115,7 +115,7 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
             at = p.n + Number.LOWER + tri(number[p.n + Number.N], 0) + 2 * term
             own = noise + number[at] * p.stride
             share = ws[moments + number[at + 1] * p.stride] * value[p.v + extra + term]
-            if ti.static(spec.cut):
+            if ti.static(spec.cut):  # noqa: SIM102 - likewise
                 if windows.of_image_square(term, p, number) == 1:
                     share = ti.select(ws[region(p, number, Region.CUT)] > V(0.5), V(0.0), share)
             ws[own] = ws[own] + share

@@ -39,9 +39,7 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
             ws[region(p, number, Region.MASK) + k * p.stride] = element
 
     @ti.func
-    def noise(
-        cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
-    ):
+    def noise(cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """WEIGHT_NOISE: the noise covariance of the columns, where the window is whole its diagonal C."""
         n, target = number[p.n + Number.N], region(p, number, Region.WEIGHT_NOISE)
         lists, factors = p.n + number[p.n + Number.CUT_LISTS], p.v + number[p.n + Number.CUT_VALUES]
@@ -55,9 +53,7 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
             ws[at] = ws[at] + ti.select(cut, moment * value[factors + e], V(0.0))
 
     @ti.func
-    def shapes(
-        cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
-    ):
+    def shapes(cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """CUT_SHAPE: X [shapes, shapes] with ``X^T W X = W2``, the shapes' products over the window with the weights w
         and w², relative to X of the constant; of that, squared and relative to the whole window's, SPREAD."""
         n, mask = number[p.n + Number.SHAPES], region(p, number, Region.MASK)
@@ -135,15 +131,13 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def of_image_square(term: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
-        """Whether a term that centred squares add to the noise is of squares of x or y: in cut windows there is none."""
+        """Whether a term that centred squares add to the noise is of squares of x or y: cut windows have none."""
         lists = p.n + number[p.n + Number.CUT_LISTS] + 3 * number[p.n + Number.CUT_NOISES]
         lists += 3 * number[p.n + Number.CUT_PRODUCTS] + 2 * number[p.n + Number.FLOW]
         return number[lists + term]
 
     @ti.func
-    def curved(
-        cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
-    ):
+    def curved(cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
         """CURVED: x², xy, y² projected on 1, x, y over the window; CENTROID: of the window."""
         mask, factor = region(p, number, Region.MASK), region(p, number, Region.CURVED_FACTOR)
         target, basis = region(p, number, Region.CURVED), number[p.n + Number.CURVED_BASIS]

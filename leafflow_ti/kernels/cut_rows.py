@@ -15,7 +15,7 @@ from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.patch import GROWTH, Patch
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.texture import texture_functions
-from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Region, Value
+from leafflow_ti.kernels.workspace import MAX_UNKNOWNS, Number, Region, Value
 
 AFFINE_CODES = 3
 """Codes of rows below this are of the flow and its derivatives along x, y."""
@@ -83,13 +83,20 @@ def cut_row_functions(spec: KernelSpec) -> SimpleNamespace:
             ws[at] = ws[at] + ws[kept + (8 + j) * p.stride] * ws[row + j * p.stride]
 
     @ti.func
-    def bend(
-        k: ti.i32, code: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()
-    ):
-        """Add the second-order part's projection to ROW, which has that of a whole window."""
+    def bend(k: ti.i32, code: ti.i32, p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
+        """Add the second-order part's projection to ROW, which has that of a whole window.
+
+        An own flow is measured elsewhere and moved by its own derivatives, with what these have of that part.
+        """
         patch, row, stride = region(p, number, Region.PATCH), region(p, number, Region.ROW), p.stride
         for axis in range(2):
-            moment = ws[region(p, number, Region.CURVED) + (3 * code + ti.select(axis == k, 2 * k, 1)) * stride]
+            part = region(p, number, Region.CURVED) + ti.select(axis == k, 2 * k, 1) * stride
+            moment = ws[part + 3 * code * stride]
+            if code == 0 and number[p.n + Number.OWN_FLOW] == 1:
+                for j in range(2):
+                    moved = ws[region(p, number, Region.GEOMETRY)] * value[p.v + Value.BASELINE + j]
+                    moved = (moved - value[p.v + Value.SHIFT + j]) * value[p.v + Value.CAMERA_STEP + j]
+                    moment = moment + moved * ws[part + 3 * (1 + j) * stride]
             if code == 0 and axis == k:
                 moment = moment - value[p.v + Value.SECOND_MOMENT + k]
             turned = moment * (precise(1.0) / value[p.v + Value.F])

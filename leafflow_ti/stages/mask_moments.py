@@ -143,11 +143,18 @@ class CutTables:
         from it in shape alone; and whether a term of ``noise_ratio`` is of squares in the image."""
         flow = self.columns.columns[: self.columns.n_flow]
         kinds = [(c.channel, c.terms[0].exponents[2:]) for c in flow]
-        of = [n for c, kind in zip(flow, kinds, strict=True) for n in (self.shapes.index(shape_of(c)), kinds.index(kind))]
+        of = [
+            n for c, kind in zip(flow, kinds, strict=True) for n in (self.shapes.index(shape_of(c)), kinds.index(kind))
+        ]
         square = [max(c.terms[0].exponents[:2]) > 1 for c in flow]
         _, terms = noise_ratio(self.sampling, self.columns, self.columns.solutions[0])
         noises = [n for term in self.noises for n in term[:3]]
-        return [*noises, *(n for term in self.products for n in term[:3]), *of, *(square[t.a] or square[t.b] for t in terms)]
+        return [
+            *noises,
+            *(n for term in self.products for n in term[:3]),
+            *of,
+            *(square[t.a] or square[t.b] for t in terms),
+        ]
 
     @property
     def values(self) -> Array:

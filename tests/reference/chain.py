@@ -239,7 +239,9 @@ class Solved:
         if cut is None:
             return cls(J, *found, noise, rho, biased=estimator == "ols")
         rho = rho * cut.share * cut.spread
-        return cls(J, *found, noise, rho, biased=estimator == "ols", turn=cut.turn, curved=cut.curved, centroid=cut.centroid)
+        return cls(
+            J, *found, noise, rho, biased=estimator == "ols", turn=cut.turn, curved=cut.curved, centroid=cut.centroid
+        )
 
     def clean(self, denoise):
         """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""

@@ -15,8 +15,8 @@ from leafflow_ti.sampling import Sampling, pixel_factor
 class Cut:
     """``noise`` [N, N]: covariance of the columns' noise; ``share`` of the window that is seen; ``spread``: the ratio
     of the sums of w² and w, relative to that of the whole window; ``turn`` [n_flow, n_flow]: B with ``B J_ff B^T`` the
-    sum over w² where the texture is the same everywhere, per that ratio; ``curved`` [3, 3]: x², xy, y² (columns) projected on 1, x, y; ``centroid`` (x, y)
-    px from the pixel."""
+    sum over w² where the texture is the same everywhere, per that ratio; ``curved`` [3, 3]: x², xy, y² (columns)
+    projected on 1, x, y; ``centroid`` (x, y) px from the pixel."""
 
     noise: np.ndarray
     share: float
@@ -46,7 +46,9 @@ class Cut:
         for i, one in enumerate(flow):
             for j, two in enumerate(flow):
                 if (one.channel, one.terms[0].exponents[2:]) == (two.channel, two.terms[0].exponents[2:]):
-                    a, b = (next(k for k, o in enumerate(order) if np.array_equal(distinct[o], shapes[n])) for n in (i, j))
+                    a, b = (
+                        next(k for k, o in enumerate(order) if np.array_equal(distinct[o], shapes[n])) for n in (i, j)
+                    )
                     B[i, j] = X[b, a] / X[0, 0]
         affine = all(columns.index("x", a) is not None for a in "xy")
         whole = pixel_factor(sampling.x, 0, 0) * pixel_factor(sampling.y, 0, 0)

@@ -270,7 +270,7 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
         C = C[0, 0]
         rows = [flows.columns.index(d, o) for d in ("x", "y") for o in flows.offsets]
         E = np.eye(flows.columns.n_flow)[rows]
-        moved = [place[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
+        moved = np.array([place[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)])
         for r, (d, o) in enumerate((d, o) for d in ("x", "y") for o in flows.offsets):
             if o == "1":
                 for axis, distance in zip(("x", "y"), moved, strict=True):
@@ -281,7 +281,9 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
             Z0, ZX, ZY, _ = surface(x0, y0, f, *geometry)
             c = 1 - ZX * x / f - ZY * y / f
             there = (-f / Z0, ZX / (Z0 * c), ZY / (Z0 * c))
-            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, *seen_of(found_own, sampling))
+            curved, centroid = seen_of(found_own, sampling)
+            curved = np.vstack([curved[0] + moved @ curved[1:], curved[1:]])
+            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, curved, centroid)
 
         codes = [*flows.offsets, *flows.offsets]
         found = rows_of(E @ p[:, 0], E @ C @ E.T, np.zeros((len(g), len(rows))), design, codes, False, q)

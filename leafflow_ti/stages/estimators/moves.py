@@ -23,8 +23,8 @@ class Move:
 
 @dataclass(frozen=True)
 class Estimator:
-    """``moves``: a function of the solver ("fast" or "jacobi"), and of whether windows may be cut. They leave parameters, residual variances and the
-    factor of the equilibrated tensor in the workspace.
+    """``moves``: a function of the solver ("fast" or "jacobi"), and of whether windows may be cut. They leave
+    parameters, residual variances and the factor of the equilibrated tensor in the workspace.
 
     ``biased``: the noise of the columns pulls solutions towards 0, which counts among their errors.
     ``weighs``: windows are weighted anew; ``robust``: by their residuals. ``denoise``: share of the gradients' own
