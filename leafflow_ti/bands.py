@@ -77,12 +77,14 @@ class Demand:
         own = problem.own_flows.requests if problem.own_flows else ()
         gpu = config.arch not in ("auto", "cpu")
         weighed = ESTIMATORS[problem.estimator].weighs
-        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize, own, gpu, weighed)
+        mask = problem.mask_moments(self.layout)
+        total = band_bytes(problem.columns, self.layout, problem.sampling, band, itemsize, own, gpu, weighed, mask)
         read = band
         if ranges and ranges.depth and ranges.layout:
             depth = ranges.depth
             read = Band.of(depth.sampling, band.in_rows, band.in_cols, 1)
-            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize, gpu=gpu)
+            mask = depth.mask_moments(ranges.layout)
+            total += band_bytes(depth.columns, ranges.layout, depth.sampling, read, itemsize, gpu=gpu, mask=mask)
         in_rows, in_cols = read.in_rows, read.in_cols
         if self.refine:
             widening = self.refine.widening(band.halo_y, band.halo_x)

@@ -54,7 +54,16 @@ class Engine:
             return kept
         own = problem.own_flows.requests if problem.own_flows else ()
         weighed = ESTIMATORS[problem.estimator].weighs
-        tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band, own, weighed)
+        tensor = TensorStage(
+            device,
+            problem.columns,
+            plan.layout,
+            problem.sampling,
+            band,
+            own,
+            weighed,
+            problem.mask_moments(plan.layout),
+        )
         first = view(tensor.out_pitch)
         ranges = RangeEngine(device, plan.ranges, problem.sampling, first, band) if plan.ranges else None
         read = ranges.outer if ranges else band

@@ -283,7 +283,7 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         )
     if model.ranges:
         depth = None if config.range_flow.depth else model_problem(capture, static(config), "depth", None)
-        own = replace(depth, noise=noise) if depth else None
+        own = replace(depth, noise=noise, cut=True) if depth else None
         preshift = _uniform(capture, config) if own else (0, 0)
         alone = sampling_of(capture, config, "reference", True)
         around = frames_around(config, alone.t)
@@ -294,7 +294,9 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         around = frames_around(config, problem.sampling.t) if model.time else (0, 0)
         frames = _frames(capture, config, around)
         preshift, adaptive = _preshift(capture, config, bool(problem.camera_axes), model.time)
-    problem = replace(problem, noise=noise)
+    # Ranges are invalid here and there.
+    cut = model.ranges or adaptive or _cut(capture, config)
+    problem = replace(problem, noise=noise, cut=cut)
     layout = TensorLayout.of(problem.columns)
     x0, y0, x1, y1 = config.output.roi or (0, 0, capture.width, capture.height)
     if x1 > capture.width or y1 > capture.height:
@@ -353,6 +355,11 @@ def _farthest(time: AxisSampling, around: tuple[int, int], frames: tuple[int, ..
         return tuple(time.around(*around).tolist())
     found = (tuple(time.about(t).around(*around).tolist()) for t in frames)
     return max(found, key=lambda offsets: max(map(abs, offsets)))
+
+
+def _cut(capture: Capture, config: RunConfig) -> bool:
+    """Whether windows may hold pixels that do not count: masked ones, ones beyond the image, invalid ones."""
+    return config.output.mask is not None or config.window.border == "clip" or not capture.finite
 
 
 def _geometry(capture: Capture) -> Geometry:

@@ -58,7 +58,10 @@ class RangeEngine:
         self.outer = Band(rows, cols, 1, radius, radius)
         if plan.depth is not None and plan.layout is not None:
             self.outer = Band.of(plan.depth.sampling, rows, cols, 1)
-            self._tensor = TensorStage(device, plan.depth.columns, plan.layout, plan.depth.sampling, self.outer)
+            self._tensor = TensorStage(
+                device, plan.depth.columns, plan.layout, plan.depth.sampling, self.outer,
+                mask=plan.depth.mask_moments(plan.layout),
+            )  # fmt: skip
             own = replace(view, step=1, rows=rows, cols=cols, pitch=self._tensor.out_pitch)
             self._estimate = EstimateStage(device, plan.depth, plan.layout, own)
 

@@ -235,7 +235,7 @@ def _sum(one: tuple[int, ...], two: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(m + n for m, n in zip(one, two, strict=True))
 
 
-def _pixel_factor(axis: AxisSampling, m: int, n: int) -> float:
+def pixel_factor(axis: AxisSampling, m: int, n: int) -> float:
     """Ratio of the moments of w² and w along an image axis; the geometric mean where an odd moment vanishes."""
 
     def ratio(power: int) -> float:
@@ -281,7 +281,7 @@ def noise_ratio(sampling: Sampling, columns: ColumnSet, solution: str) -> tuple[
         value = 1.0
         for name, m, n in zip(AXES, one, two, strict=True):
             axis = sampling.axis(name)
-            value *= _pixel_factor(axis, m, n) if name in ("x", "y") else _series_factor(axis, name == solution, m, n)
+            value *= pixel_factor(axis, m, n) if name in ("x", "y") else _series_factor(axis, name == solution, m, n)
         return value
 
     n = columns.n_flow
@@ -317,7 +317,7 @@ def cross_noise(sampling: Sampling, columns: ColumnSet, first: str, second: str)
     def series(axis: AxisSampling, derivative_power: int, smooth_power: int) -> float:
         return float(np.dot(axis.response(True, derivative_power), axis.response(False, smooth_power)))
 
-    value = series(one, 0, 1) * series(two, 0, 1) * _pixel_factor(sampling.x, 0, 0) * _pixel_factor(sampling.y, 0, 0)
+    value = series(one, 0, 1) * series(two, 0, 1) * pixel_factor(sampling.x, 0, 0) * pixel_factor(sampling.y, 0, 0)
     terms = []
     for p in ("x", "y", "i"):
         for q in ("x", "y", "i"):

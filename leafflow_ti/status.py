@@ -33,7 +33,7 @@ ADVICE: dict[Status, str] = {
     Status.NOT_CONVERGED: "the solver found no isolated solution: use --precision f64 or a larger window",
     Status.BORDER: "the window reaches beyond an image: a smaller one, or --border clip, measures closer to the edge",
     Status.MASKED: "outside the given mask",
-    Status.NOT_FINITE: "the images hold NaN or infinite grey values here",
+    Status.NOT_FINITE: "the images hold no usable grey values here: NaN, infinite, saturated or dead pixels",
     Status.UNREFINED: "the exact refinement did not converge, fitted no better, or would mix surfaces that a robust "
     "estimate told apart: the values are those before it",
     Status.CONTESTED: "two surfaces meet here: the values are those of the one that explains the images better",

@@ -186,7 +186,8 @@ class Stays:
             if name in sample.maps:
                 maps[name] = sample.maps[name][stay.centre].astype(np.float32)
             else:
-                maps[name] = planes[plane_of(base) + (Output.STD if name != base else 0)].astype(np.float32)
+                with np.errstate(over="ignore"):  # numbers of pixels that have no value
+                    maps[name] = planes[plane_of(base) + (Output.STD if name != base else 0)].astype(np.float32)
         found = settle(maps, status, self.plan.limits)
         # Texture in all directions, and nothing determined: the window is too small, or degenerate.
         status[(status == Status.OK) & (found == 0)] = Status.NOT_CONVERGED

@@ -258,7 +258,7 @@ def _solve_flops(problem: Problem, request: Request) -> float:
     columns, estimator = request.columns, ESTIMATORS[problem.estimator]
     flow = columns.n_flow
     plain = estimator.robust and problem.robust == "failed"
-    moves = [move for move in estimator.moves(problem.solver) if not (plain and move.anew)]
+    moves = [move for move in estimator.moves(problem.solver, False) if not (plain and move.anew)]
     fast = any(move.stage == Stage.INVERSE_ITERATION for move in moves)
     cells = Cells(request) if estimator.weighs else None
     wanted = [move for move in moves if move.stage != Stage.JACOBI or not fast]

@@ -125,7 +125,9 @@ class Stages:
         """Builds the stages; compiles nothing."""
         problem = plan.problem
         band = Band.of(problem.sampling, len(plan.y), len(plan.x), plan.x.step)
-        tensor = TensorStage(device, problem.columns, plan.layout, problem.sampling, band)
+        tensor = TensorStage(
+            device, problem.columns, plan.layout, problem.sampling, band, mask=problem.mask_moments(plan.layout)
+        )
         view = _view(plan, band, tensor.out_pitch)
         estimate = EstimateStage(device, problem, plan.layout, view, bool(plan.margin))
         y0, x0 = plan.y.start - band.halo_y, plan.x.start - band.halo_x

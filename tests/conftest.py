@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from reference import cells, chain
 from reference import estimators as weighted
+from reference.cut import Cut
 
 from leafflow_ti.field import MOTION_NAMES
 from leafflow_ti.filters import filter_set
@@ -30,6 +31,7 @@ from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import EstimateStage, View
 from leafflow_ti.stages.estimators import ESTIMATORS
+from leafflow_ti.stages.mask_moments import MaskMoments
 from leafflow_ti.stages.problem import OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, Request, TensorStage
 from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
@@ -188,7 +190,9 @@ class Bench:
             sampling, columns = self.own_columns
             layout = TensorLayout.of(columns)
             own = [Request(columns, layout, sampling, (y, x)) for x, y in self.steps]
-        stage = TensorStage(self.device, self.columns, self.layout, self.sampling, self.band, own, weighed=weighed)
+        requests = (Request(self.columns, self.layout, self.sampling), *own)
+        mask = None if weighed else MaskMoments.of(requests)
+        stage = TensorStage(self.device, self.columns, self.layout, self.sampling, self.band, own, weighed, mask)
         valid = np.ones((len(self.images), *self.images.shape[3:]), bool) if self.valid is None else self.valid
         found = [stage.push(block, ok) for block, ok in zip(self.images, valid, strict=True)]
         assert all(tensor is None for tensor in found[:-1])
@@ -221,7 +225,8 @@ class Bench:
             ..., y - self.band.halo_y : y + self.band.halo_y + 1, x - self.band.halo_x : x + self.band.halo_x + 1
         ]
         at = (self.band.halo_x, self.band.halo_y)
-        return [cells.window(self.own_images(*s)[part], *self.own_columns, at, None, weighed) for s in self.steps]
+        valid = None if self.valid is None else self.valid[part]
+        return [cells.window(self.own_images(*s)[part], *self.own_columns, at, valid, weighed) for s in self.steps]
 
     @cached_property
     def planes(self) -> np.ndarray:
@@ -246,13 +251,24 @@ class Bench:
         """J [N, N] or, where windows are weighted, the cells of one output pixel by the naive twin; and ρ."""
         return cells.window(self.images, self.sampling, self.columns, self.position(row, col), self.valid, weighed)
 
+    def cut(self, row: int, col: int, sampling: Sampling, columns: ColumnSet) -> Cut | None:
+        """What the mask makes of the window of one output pixel; None where it is whole."""
+        if self.valid is None:
+            return None
+        images = np.zeros((len(self.valid), 1, 1, *self.valid.shape[1:]))
+        alone = replace(sampling, sx=AxisSampling(), sy=AxisSampling())
+        _, seen = chain.window_of(images, alone, column_set(MODELS["flow"], "none", (), {}), self.position(row, col),
+                                  self.valid)  # fmt: skip
+        return None if seen.all() else Cut.of(seen, sampling, columns)
+
     def solved(self, row: int, col: int, problem: Problem) -> tuple[chain.Solved, list[chain.Solved]]:
         """What the naive twin finds at one output pixel, and from every camera's own flow."""
 
         def solve(J: Any, rho: float, sampling: Sampling, columns: ColumnSet) -> chain.Solved:
             if weighed:
                 return weighted.estimate(J, problem).solved(rho, ESTIMATORS[problem.estimator].biased)
-            return chain.Solved.of(J, rho, columns, sampling, problem.estimator, problem.scale)
+            cut = self.cut(row, col, sampling, columns) if problem.cut else None
+            return chain.Solved.of(J, rho, columns, sampling, problem.estimator, problem.scale, cut)
 
         weighed = ESTIMATORS[problem.estimator].weighs
         own = self.own_reference(row, col, weighed) if problem.own_flows else []
@@ -314,6 +330,7 @@ class Bench:
                 )
         elif not self.sampling.camera_axes:
             options["offsets"] = flow_offsets(self.columns)
+        options.setdefault("cut", self.valid is not None)
         problem = Problem(self.columns, self.sampling, **options)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("leafflow_ti.stages.estimate.BATCH_BYTES", 64 << 20)  # one batch: its workspace is looked at
@@ -335,7 +352,7 @@ class Bench:
         own = TensorLayout.of(self.own_columns[1])
         sizes = [len(layout.entries) + EXTRA_PLANES for layout in (self.layout, *[own] * len(self.steps))]
         starts = np.cumsum([0, *sizes]) * self.band.rows * stage.out_pitch
-        parts = np.split(np.array(self.device.host(tensors)), starts[1:-1])
+        parts = np.split(np.array(self.device.host(tensors)), starts[1:])
         own_parts = [parts[1 + i] * (n not in lost) for n, i in enumerate(kept)]
         return self.device.array(np.concatenate([parts[0], *own_parts]))
 

@@ -21,6 +21,8 @@ import numpy.typing as npt
 
 from leafflow_ti.capture.channels import Array
 from leafflow_ti.capture.description import Description
+from leafflow_ti.capture.flaws import Flaws
+from leafflow_ti.capture.images import checksum
 from leafflow_ti.capture.lens import Lens
 from leafflow_ti.capture.measured import FRACTION_DIGITS, LEAST_FRACTION, REACH, interpolated
 
@@ -75,11 +77,13 @@ class Capture(ABC):
     """Measured time of each frame; None: one ``frame_interval_s`` after the other."""
     lenses: tuple[tuple[Lens, ...], ...] | None = field(default=None, repr=False, kw_only=True)
     """For each camera row and column the lens whose distortion is taken out; None: images are taken as they are."""
+    flaws: Flaws | None = field(default=None, repr=False, kw_only=True)
+    """Pixels that are read as NaN."""
 
     @property
     def finite(self) -> bool:
         """Whether every grey value inside the images is known to be a number."""
-        return self.dtype.kind in "bui" and self.lenses is None
+        return self.dtype.kind in "bui" and self.lenses is None and self.flaws is None
 
     @property
     def reference(self) -> tuple[int, int]:
@@ -130,12 +134,16 @@ class Capture(ABC):
         return first_y, last_y, first_x, last_x
 
     def _measured(self) -> dict[str, Any]:
-        """Measured positions and stamps for the fingerprint."""
+        """Measured positions and stamps, and flawed pixels, for the fingerprint."""
         found: dict[str, Any] = {}
         if self.positions_mm is not None:
             found["positions_mm"] = self.positions_mm.round(9).tolist()
         if self.stamps_s is not None:
             found["stamps_s"] = list(self.stamps_s)
+        if self.flaws and self.flaws.saturated is not None:
+            found["saturated"] = self.flaws.saturated
+        if self.flaws and self.flaws.files:
+            found["dead_sha256"] = [checksum(path) for path in self.flaws.files]
         return found
 
     @abstractmethod
@@ -214,6 +222,11 @@ class Capture(ABC):
                     place = y0 + float(shift_y[sy, sx]), x0 + float(shift_x[sy, sx])
                     yield partial(self._read_at, out[i, j, k], t, sy, sx, *place)
 
+    def _sound(self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int) -> Array:
+        """The same as ``_window`` without flawed pixels."""
+        window = self._window(t, sy, sx, y0, y1, x0, x1)
+        return window if self.flaws is None else self.flaws.without(window, sy, sx, y0, x0)
+
     def _read_at(self, out: Array, t: int, sy: int, sx: int, top: float, left: float) -> None:
         """The same as ``_read_into`` at a place between pixels. Images are interpolated once: with a lens, where that
         takes out its distortion."""
@@ -245,7 +258,7 @@ class Capture(ABC):
             return
         inside = out[y0 - top : y1 - top, x0 - left : x1 - left]
         if self.lenses is None:
-            inside[...] = self._window(t, sy, sx, y0, y1, x0, x1)
+            inside[...] = self._sound(t, sy, sx, y0, y1, x0, x1)
         else:
-            size, read = (self.height, self.width), partial(self._window, t, sy, sx)
+            size, read = (self.height, self.width), partial(self._sound, t, sy, sx)
             self.lenses[sy][sx].rectify(inside, y0, x0, size, read, fraction)

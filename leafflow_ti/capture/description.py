@@ -10,6 +10,9 @@
     # channel = "luminance"           colour to grey: luminance (.299 R + .587 G + .114 B), mean, red, green, blue,
     #                                 or the index of a stored sample
     # bit_depth = 12                  significant bits where the file states more, e.g. 12 padded to 16
+    # saturated = 250                 grey value from which on a pixel does not count; "auto": the largest one of the
+    #                                 bit depth. Without it all count
+    # dead = "dead.png"               non-zero: dead pixels of the sensor; "dead_{sx}.png" (fields sx, sy): of each one
     [camera]
     focal_length_px = 2800.0          # or focal_length_mm and pixel_pitch_mm
     principal_point_px = [319.5, 239.5]          # default: image centre (W-1)/2, (H-1)/2
@@ -35,7 +38,7 @@ import json
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -65,6 +68,14 @@ _Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
 _PerAxis = Annotated[tuple[_Finite, ...], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
 
 
+def _of_cameras(name: str | None) -> str | None:
+    """The name of a file that may be one for each camera."""
+    other = set(Pattern.parse(name).fields) - {"sx", "sy"} if name is not None else set()
+    if other:
+        raise ValueError(f"field '{{{min(other)}}}': one file for all cameras, or the fields sx and sy")
+    return name
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -80,6 +91,18 @@ class Images(_Section):
     select: dict[StrictStr, tuple[StrictInt, ...]] = {}
     channel: Any = "luminance"
     bit_depth: Annotated[StrictInt, Field(ge=1, le=32)] | None = None
+    saturated: _Finite | Literal["auto"] | None = None
+    dead: StrictStr | None = None
+
+    @property
+    def dead_pattern(self) -> Pattern | None:
+        """The name of the file of dead pixels, with a field for each axis of cameras that it is given for."""
+        return None if self.dead is None else Pattern.parse(self.dead)
+
+    @field_validator("dead")
+    @classmethod
+    def _one_dead_file_per_camera(cls, value: str | None) -> str | None:
+        return _of_cameras(value)
 
     @property
     def file_pattern(self) -> Pattern:
@@ -151,10 +174,7 @@ class Camera(_Section):
     @field_validator("calibration")
     @classmethod
     def _one_file_per_camera(cls, value: str | None) -> str | None:
-        other = set(Pattern.parse(value).fields) - {"sx", "sy"} if value is not None else set()
-        if other:
-            raise ValueError(f"field '{{{min(other)}}}': one file for all cameras, or the fields sx and sy")
-        return value
+        return _of_cameras(value)
 
     @model_validator(mode="after")
     def _one_focal_length(self) -> Self:

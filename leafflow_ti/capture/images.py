@@ -7,6 +7,7 @@ must stay exact.
 
 from __future__ import annotations
 
+import hashlib
 from functools import lru_cache
 from pathlib import Path
 
@@ -95,3 +96,9 @@ def _format_of(path: Path, _size: int, _mtime_ns: int) -> str:
         return "pnm"
     found = "an empty file" if not head else "another format"
     raise InputError(f"{path}: {found}, not TIFF, PNG, PGM or PPM: convert it, or narrow the pattern")
+
+
+def checksum(path: Path) -> str:
+    """sha256 of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

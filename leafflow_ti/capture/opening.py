@@ -11,6 +11,7 @@ import numpy.typing as npt
 from leafflow_ti.capture.cache import ImageCache
 from leafflow_ti.capture.capture import Geometry
 from leafflow_ti.capture.description import FILE_NAME, Description, read_description
+from leafflow_ti.capture.flaws import find_flaws
 from leafflow_ti.capture.layout import find_layout
 from leafflow_ti.capture.measured import (
     camera_positions,
@@ -62,6 +63,7 @@ def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Fi
         layout=layout,
         channel=description.images.channel,
         lenses=rectified.lenses if rectified else None,
+        flaws=find_flaws(path, description.images, layout, info.dtype, bits),
         _cache=ImageCache(cache_bytes),
     )
 

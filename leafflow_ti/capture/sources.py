@@ -13,7 +13,7 @@ import numpy as np
 from leafflow_ti.capture.cache import ImageCache
 from leafflow_ti.capture.capture import Capture
 from leafflow_ti.capture.channels import Array, Channel
-from leafflow_ti.capture.images import read_window
+from leafflow_ti.capture.images import checksum, read_window
 from leafflow_ti.capture.layout import Layout
 from leafflow_ti.errors import InputError
 
@@ -71,10 +71,10 @@ class FileCapture(Capture):
         ends = {"first_file_sha256": self.layout.paths[0], "last_file_sha256": self.layout.paths[-1]}
         calibrations = dict.fromkeys(lens.calibration.path for row in self.lenses or () for lens in row)
         return {
-            **({"calibration_sha256": [_sha256(path) for path in calibrations]} if calibrations else {}),
+            **({"calibration_sha256": [checksum(path) for path in calibrations]} if calibrations else {}),
             "files": len(self.layout.paths),
             "names_and_sizes_sha256": listing.hexdigest(),
-            **({name: _sha256(path) for name, path in ends.items()} if contents else {}),
+            **({name: checksum(path) for name, path in ends.items()} if contents else {}),
             **self._measured(),
         }
 
@@ -95,8 +95,3 @@ class ArrayCapture(Capture):
         if contents:
             found["sha256"] = hashlib.sha256(np.ascontiguousarray(self.images).data).hexdigest()
         return found | self._measured()
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -8,6 +8,7 @@ one more smoothing.
 import functools
 from types import SimpleNamespace
 
+from leafflow_ti.kernels.cut import cut_stages
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
@@ -22,6 +23,7 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``clean``, then ``row_covariance`` and ``add_camera`` per solution, and ``geometry``."""
     precise, V = spec.precise, spec.element
     small, texture, identify = dense(spec), texture_functions(spec), identify_functions(spec)
+    windows = cut_stages(spec)
 
     @ti.func
     def clean(
@@ -39,8 +41,11 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
                 s = value[p.v + Value.SCALE + r] * value[p.v + Value.SCALE + c]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride] * s
                 noise = V(ti.select(r == c, value[p.v + Value.NOISE + r], precise(0.0)))
-                if number[p.n + Number.REWEIGHTED] == 1:
-                    noise = ws[region(p, number, Region.WEIGHT_NOISE) + tri(r, c) * p.stride]
+                own = region(p, number, Region.WEIGHT_NOISE) + tri(r, c) * p.stride
+                if ti.static(spec.cut):
+                    noise = ti.select(ws[region(p, number, Region.CUT)] > V(0.5), ws[own], noise)
+                elif number[p.n + Number.REWEIGHTED] == 1:
+                    noise = ws[own]
                 if r == c:
                     floor = floor + element * value[p.v + Value.RIDGE]
                 element = element - quietest * noise * (value[p.v + Value.DENOISE] * s)
@@ -101,12 +106,19 @@ def covariance_stages(spec: KernelSpec) -> SimpleNamespace:
                 ratio = value[p.v + Value.RATIO + p.which * size + tri(r, c)]
                 element = ws[moments + number[p.n + Number.LOWER + tri(r, c)] * p.stride]
                 ws[noise + tri(r, c) * p.stride] = element * (s * ratio)
+        if ti.static(spec.cut):  # noqa: SIM102 - the engine decides the one before it compiles the other
+            if texture.any_cut(p, number, ws) == 1:
+                windows.equation_noise(noise, p, number, value, ws)
         terms = number[p.n + Number.NOISE_TERMS]
         extra = Value.RATIO + number[p.n + Number.SOLUTIONS] * size + p.which * terms
         for term in range(terms):
             at = p.n + Number.LOWER + tri(number[p.n + Number.N], 0) + 2 * term
             own = noise + number[at] * p.stride
-            ws[own] = ws[own] + ws[moments + number[at + 1] * p.stride] * value[p.v + extra + term]
+            share = ws[moments + number[at + 1] * p.stride] * value[p.v + extra + term]
+            if ti.static(spec.cut):  # noqa: SIM102 - likewise
+                if windows.of_image_square(term, p, number) == 1:
+                    share = ti.select(ws[region(p, number, Region.CUT)] > V(0.5), V(0.0), share)
+            ws[own] = ws[own] + share
         response(target, rows_at, n_rows, p, number, value, ws)
         small.symmetric_times(ws, noise, target, product, flow, n_rows, p.stride)
         factor = texture.smoothness(p, number, ws) * ws[region(p, number, Region.VARIANCE) + p.which * p.stride]

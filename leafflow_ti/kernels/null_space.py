@@ -13,11 +13,14 @@ from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.identify import identify_functions
 from leafflow_ti.kernels.spec import EXTRA_PLANES, KernelSpec
+from leafflow_ti.kernels.texture import texture_functions
 from leafflow_ti.kernels.workspace import Number, Region, Value
 
 JACOBI_SWEEPS = 16
 RITZ_SWEEPS = 8
 ROUNDS = 6
+WHOLE = 0.9999
+"""Share of the weights of a window that is seen from which on it counts as whole."""
 
 
 @functools.cache
@@ -26,7 +29,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     ``parameters``, ``residuals`` and ``centre``; and what stages of weighted windows share with them: ``keep``,
     ``left_out``, ``unsolved``."""
     precise, lanes, V = spec.precise, spec.lanes, spec.element
-    small, identify = dense(spec), identify_functions(spec)
+    small, identify, texture = dense(spec), identify_functions(spec), texture_functions(spec)
 
     @ti.func
     def load(
@@ -46,8 +49,11 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                     element[i] = ti.cast(J[begin + i], precise)
             ws[moments + k * p.stride] = element
         ws[region(p, number, Region.CONVERGED)] = V(0.0)
-        if number[p.n + Number.REWEIGHTED] == 1:
-            ws[region(p, number, Region.ACTIVE)] = V(1.0)
+        ws[region(p, number, Region.ACTIVE)] = V(1.0)
+        if ti.static(spec.cut):
+            mass = ws[moments + number[p.n + Number.EXTRA] * p.stride]
+            cut = (mass < V(WHOLE)) & (mass >= V(value[p.v + Value.MIN_MASS]))
+            ws[region(p, number, Region.CUT)] = ti.select(cut, V(1.0), V(0.0))
 
     @ti.func
     def left_out(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
@@ -119,10 +125,9 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
 
     @ti.func
     def unsolved(p: ti.template(), number: ti.template(), ws: ti.template()):
-        """A new solution is wanted: where windows are weighted anew only there."""
+        """A new solution is wanted, of the active pixels only."""
         flag = region(p, number, Region.CONVERGED)
-        if number[p.n + Number.REWEIGHTED] == 1:
-            ws[flag] = ti.select(ws[region(p, number, Region.ACTIVE)] > V(0.5), V(0.0), ws[flag])
+        ws[flag] = ti.select(ws[region(p, number, Region.ACTIVE)] > V(0.5), V(0.0), ws[flag])
 
     @ti.func
     def accept(
@@ -264,13 +269,11 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
             for r in range(n):
                 at = vectors + (r * k + j) * p.stride
                 ws[at] = ws[at] * inverse
-        chosen = V(1.0)
-        if number[p.n + Number.REWEIGHTED] == 1:
-            chosen = ws[region(p, number, Region.ACTIVE)]
+        chosen = ws[region(p, number, Region.ACTIVE)] > V(0.5)
         for j in range(k):
             for f in range(flow):
                 at = target + (j * flow + f) * p.stride
-                ws[at] = ti.select(chosen > V(0.5), ws[vectors + (f * k + j) * p.stride], ws[at])
+                ws[at] = ti.select(chosen, ws[vectors + (f * k + j) * p.stride], ws[at])
 
     @ti.func
     def weighted_noise(
@@ -305,7 +308,11 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
                     element = ws[found + (j * flow + r) * p.stride] * unit
                 norm = norm + element * element * (value[p.v + Value.NOISE + r] / (unit * unit))
                 ws[vectors + (r * k + j) * p.stride] = element
-            if number[p.n + Number.REWEIGHTED] == 1:
+            if ti.static(spec.cut):
+                if texture.any_cut(p, number, ws) == 1:
+                    cut = ws[region(p, number, Region.CUT)] > V(0.5)
+                    norm = ti.select(cut, weighted_noise(j, k, p, number, value, ws), norm)
+            elif number[p.n + Number.REWEIGHTED] == 1:
                 norm = weighted_noise(j, k, p, number, value, ws)
             ws[region(p, number, Region.VARIANCE) + j * p.stride] = norm
         small.upper_times(ws, region(p, number, Region.TENSOR), vectors, images, n, k, p.stride)
@@ -327,8 +334,11 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
             total = V(0.0)
             for c in range(flow):
                 element = V(ti.select(r == c, value[p.v + Value.NOISE + r], precise(0.0)))
-                if number[p.n + Number.REWEIGHTED] == 1:
-                    element = ws[noise + tri(ti.max(r, c), ti.min(r, c)) * p.stride]
+                here = noise + tri(ti.max(r, c), ti.min(r, c)) * p.stride
+                if ti.static(spec.cut):
+                    element = ti.select(ws[region(p, number, Region.CUT)] > V(0.5), ws[here], element)
+                elif number[p.n + Number.REWEIGHTED] == 1:
+                    element = ws[here]
                 total = total + element * ws[vectors + (c * k + j) * p.stride] * value[p.v + Value.SCALE + c]
             at = region(p, number, Region.BIAS) + (j * flow + r) * p.stride
             ws[at] = total * variance * value[p.v + Value.SCALE + r]

@@ -25,12 +25,14 @@ class Stage(IntEnum):
     MEASURED = auto()
     MOTION = auto()
     EMIT = auto()
-    # From here on: of estimators that weigh windows anew. Who does not need them does not wait for their compilation.
+    # From here on: where windows may be cut. Who does not need what follows does not wait for its compilation.
+    CUT_WINDOWS = auto()
+    WHITEN = auto()
+    UNWHITEN = auto()
+    # From here on: of estimators that weigh windows anew.
     BEGIN_WEIGHTS = auto()
     REWEIGHT = auto()
     RELAX = auto()
-    WHITEN = auto()
-    UNWHITEN = auto()
     FUNDAMENTAL = auto()
 
 

@@ -9,6 +9,7 @@ are formulas of ``patch``.
 import functools
 from types import SimpleNamespace
 
+from leafflow_ti.kernels.cut_rows import cut_row_functions
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
@@ -31,6 +32,7 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
     last one. Its ``which`` is a sum of the above."""
     precise, V = spec.precise, spec.element
     small, patch, texture = dense(spec), patch_functions(spec), texture_functions(spec)
+    cut = cut_row_functions(spec)
 
     @ti.func
     def code_of(r: ti.i32, p: ti.template(), number: ti.template()) -> ti.i32:
@@ -46,10 +48,14 @@ def patch_fit_stages(spec: KernelSpec) -> SimpleNamespace:
         """Leave the coefficients of equation ``r`` in ROW; what they give for the present motion."""
         code, offsets = code_of(r, p, number), number[p.n + Number.OFFSETS]
         result = V(0.0)
+        if ti.static(spec.cut):
+            cut.before(code, p, number, value, ws)
         if code == RANGE_CODE:
             result = patch.range_row(p, number, value, ws)
         else:
             result = patch.motion_row(r // offsets, code, p, number, value, ws)
+        if ti.static(spec.cut):
+            result = cut.behind(r // offsets, code, result, p, number, value, ws)
         return result
 
     @ti.func

@@ -17,12 +17,16 @@ EXTRA_PLANES = 4
 
 @dataclass(frozen=True)
 class KernelSpec:
-    """``storage``: type of images and moments; ``algebra``: type of the small dense matrices; "f32" or "f64"."""
+    """``storage``: type of images and moments; ``algebra``: type of the small dense matrices; "f32" or "f64".
+
+    ``cut``: windows may be cut by a mask or a border; who has none does not wait for what that takes.
+    """
 
     storage: str = "f32"
     algebra: str = "f64"
     lanes: int = 32
     gpu: bool = False
+    cut: bool = False
 
     @property
     def real(self):

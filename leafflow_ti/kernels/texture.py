@@ -3,7 +3,7 @@
 import functools
 from types import SimpleNamespace
 
-from leafflow_ti.kernels.dense import tri
+from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
 from leafflow_ti.kernels.group import region
 from leafflow_ti.kernels.spec import KernelSpec
@@ -16,15 +16,22 @@ but then the residual tells; a model with many columns fits a small window's noi
 
 @functools.cache
 def texture_functions(spec: KernelSpec) -> SimpleNamespace:
-    """``smoothness``, ``gradient``, ``noise_variance`` and ``gradient_noise``."""
+    """``any_cut``, ``smoothness``, ``gradient``, ``noise_variance`` and ``gradient_noise``."""
     V = spec.element
+    small = dense(spec)
+
+    @ti.func
+    def any_cut(p: ti.template(), number: ti.template(), ws: ti.template()) -> ti.i32:
+        """Whether a window of the group is cut."""
+        return small.any_lane(ws[region(p, number, Region.CUT)] > V(0.5))
 
     @ti.func
     def smoothness(p: ti.template(), number: ti.template(), ws: ti.template()):
         """The factor ρ of the noise that filters leave: the share of the gradient's energy that survives one more
         smoothing.
 
-        Where only a part of the window is seen, the residual's variance by the noise of a whole one is too small by it.
+        Where only a part of the window is seen and C is that of a whole one, the residual's variance is too small by
+        it.
         """
         energy = region(p, number, Region.MOMENTS) + (number[p.n + Number.EXTRA] + 1) * p.stride
         seen, plain, smooth = ws[energy - p.stride], ws[energy], ws[energy + p.stride]
@@ -34,7 +41,11 @@ def texture_functions(spec: KernelSpec) -> SimpleNamespace:
             # The same noise, by fewer or more unequal samples.
             share = share * ws[region(p, number, Region.SPREAD)]
         else:
-            share = share / ti.max(seen, V(1e-6))
+            whole = share / ti.max(seen, V(1e-6))
+            if ti.static(spec.cut):
+                cut = ws[region(p, number, Region.CUT)] > V(0.5)
+                whole = ti.select(cut, share * ws[region(p, number, Region.SPREAD)], whole)
+            share = whole
         return share
 
     @ti.func
@@ -63,5 +74,6 @@ def texture_functions(spec: KernelSpec) -> SimpleNamespace:
         return ti.max(explained, ti.min(known, residual * TRUSTED))
 
     return SimpleNamespace(
-        smoothness=smoothness, gradient=gradient, noise_variance=noise_variance, gradient_noise=gradient_noise
-    )
+        any_cut=any_cut, smoothness=smoothness, gradient=gradient, noise_variance=noise_variance,
+        gradient_noise=gradient_noise,
+    )  # fmt: skip

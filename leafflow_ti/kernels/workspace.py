@@ -75,13 +75,22 @@ class Region(IntEnum):
     RIGHT = auto()  # [3, G + F, Q]: what is correlated with them
     REFERENCE_VARIANCE = auto()  # [1]
     BIAS = auto()  # [k, F]: of the scaled normal equations, by the noise of their columns; empty without one
-    ACTIVE = auto()  # [1]: 1 where the window is weighted anew; from here on: empty unless windows are
-    SPREAD = auto()  # [1]: what the weights make of the variance of the normal equations' noise
-    SHARE = auto()  # [1]: mean weight
+    ACTIVE = auto()  # [1]: 1 where a solution is wanted: once there is one, where the window is cut or weighted anew
+    CUT = auto()  # [1]: 1 where the window is cut; WEIGHT_NOISE then takes the place of C
+    WEIGHT_NOISE = auto()  # packed [N]: Σ w ω C, as the tensor now is; of the fundamental scheme what it takes off
+    NOISE_FACTOR = auto()  # packed [N]: its factor, scaled; these two empty unless windows are cut or weighted anew
+    SPREAD = auto()  # [1]: what mask or weights make of the variance of the normal equations' noise
+    MASK = auto()  # [planes]: moments of the valid part of the window; these and the next seven empty unless cut
+    CUT_PRODUCTS = auto()  # packed [shapes]: the shapes' products over the window, then their factor
+    CUT_SQUARED = auto()  # packed [shapes]: the same with the squared weights
+    CUT_SHAPE = auto()  # [shapes, shapes]: what leads from the former to the latter
+    CURVED = auto()  # [3, 3]: x², xy, y² projected on 1, x, y
+    CURVED_FACTOR = auto()  # packed [3]
+    CENTROID = auto()  # [2]: of what is seen, px from the pixel; 0 where the window is whole
+    CUT_PATCH = auto()  # [11]: patch and velocity at the pixel while rows are made for the centroid (kernels.cut_rows)
+    SHARE = auto()  # [1]: mean weight; from here on: empty unless windows are weighted anew
     SCALE_SQUARED = auto()  # [1]: σ² of the penalty
     LEAST_SQUARED = auto()  # [1]: the least that it may become
-    WEIGHT_NOISE = auto()  # packed [N]: Σ w ω C, as the tensor now is; of the fundamental scheme what it takes off
-    NOISE_FACTOR = auto()  # packed [N]: its factor, scaled
     QUADRATIC = auto()  # [entries]: the mean squared residual as a function of the tensor's entries
     RELATIVE = auto()  # [monomials]: the mean relative noise as a function of the offset
     WEIGHT_SUMS = auto()  # [entries, then 2 x monomials]: of weighted cells; of their offsets' monomials
@@ -98,7 +107,8 @@ class Layout:
     ``moments``: planes of the largest tensor. ``rows_t`` and ``motion``: the largest numbers of motion rows and of
     equations of any camera. ``unknowns`` of the motion fit; ``correlated``: columns whose noise cameras share;
     ``maps``: output planes; ``sources``, ``monomials``: of the largest cell where windows are weighted anew, else 0;
-    ``biased``: solutions are, by the noise of all columns but the time-like ones.
+    ``biased``: solutions are, by the noise of all columns but the time-like ones; ``mask``, ``shapes``: moments of cut
+    windows and shapes of columns, 0 where none is cut.
     """
 
     n: int
@@ -114,6 +124,8 @@ class Layout:
     sources: int = 0
     monomials: int = 0
     biased: bool = False
+    mask: int = 0
+    shapes: int = 0
 
     @property
     def sizes(self) -> dict[Region, int]:
@@ -121,7 +133,8 @@ class Layout:
         n, k, terms, motion, q = self.n, self.k, self.terms, self.motion, self.unknowns
         s, t, errors = self.rows_s, self.rows_t, self.terms + self.correlated
         flow = n - k
-        anew = int(self.sources > 0)
+        anew, cut = int(self.sources > 0), int(self.mask > 0)
+        own = max(anew, cut)
 
         def packed(m: int) -> int:
             return m * (m + 1) // 2
@@ -178,13 +191,22 @@ class Layout:
             Region.RIGHT: 3 * errors * q,
             Region.REFERENCE_VARIANCE: 1,
             Region.BIAS: k * flow * int(self.biased),
-            Region.ACTIVE: anew,
-            Region.SPREAD: anew,
+            Region.ACTIVE: 1,
+            Region.CUT: cut,
+            Region.WEIGHT_NOISE: own * packed(n),
+            Region.NOISE_FACTOR: own * packed(n),
+            Region.SPREAD: own,
+            Region.MASK: self.mask,
+            Region.CUT_PRODUCTS: packed(self.shapes),
+            Region.CUT_SQUARED: packed(self.shapes),
+            Region.CUT_SHAPE: self.shapes**2,
+            Region.CURVED: 9 * cut,
+            Region.CURVED_FACTOR: 6 * cut,
+            Region.CENTROID: 2 * cut,
+            Region.CUT_PATCH: 11 * cut,
             Region.SHARE: anew,
             Region.SCALE_SQUARED: anew,
             Region.LEAST_SQUARED: anew,
-            Region.WEIGHT_NOISE: anew * packed(n),
-            Region.NOISE_FACTOR: anew * packed(n),
             Region.QUADRATIC: anew * self.moments,
             Region.RELATIVE: self.monomials,
             Region.WEIGHT_SUMS: anew * self.moments + 2 * self.monomials,
@@ -239,6 +261,14 @@ class Number(IntEnum):
     STEP = auto()
     PITCH = auto()
     BIASED = auto()  # what the noise of the columns does to solutions counts among their errors
+    MASK_PLANES = auto()  # moments of the valid part of windows; 0: none is cut, and the next seven mean nothing
+    MASK_PLANE = auto()  # where they begin among the planes
+    CURVED_BASIS = auto()  # 3: the flow's second-order part is projected on 1, x, y; 1: on 1
+    SHAPES = auto()  # of columns by their offsets in x and y
+    CUT_NOISES = auto()  # terms of the noise's covariance
+    CUT_PRODUCTS = auto()  # terms of the shapes' products
+    CUT_LISTS = auto()  # where the lists of ``stages.mask_moments`` begin behind this table's first entry
+    CUT_VALUES = auto()  # likewise in the table of values
     REWEIGHTED = auto()  # windows are weighted anew; what begins with CELL or SOURCE means something only then
     ROBUST = auto()  # rows of own flows that contradict the reference's are left out
     EVERYWHERE = auto()  # in every pixel, else where the plain fit failed

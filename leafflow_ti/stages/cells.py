@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from leafflow_ti.blocks import Blocks
 from leafflow_ti.models import AXES, Entry
-from leafflow_ti.sampling import channel_noise
 from leafflow_ti.stages.channels import MASS, MapKey, Request
+from leafflow_ti.stages.mask_moments import noise_terms
 from leafflow_ti.stages.windows import BlockMap
 
 Array = NDArray[np.float64]
@@ -76,17 +76,10 @@ class Cells:
 
     def _noises(self) -> list[tuple[int, int, int, float]]:
         """Terms of the noise's covariance: row and column of the lower triangle, monomial of (x, y), factor."""
-        columns, sampling = self.request.columns, self.request.sampling
         found: dict[tuple[int, int, int], float] = {}
-        for r, one in enumerate(columns.columns):
-            for c, two in enumerate(columns.columns[: r + 1]):
-                for p, q in product(one.terms, two.terms):
-                    e = [m + n for m, n in zip(p.exponents, q.exponents, strict=True)]
-                    others = math.prod(sampling.axis(a).moment(e[AXES.index(a)]) for a in ("sx", "sy", "t"))
-                    if (p.channel, p.vector) == (q.channel, q.vector) and others:
-                        monomial = self.monomials.setdefault((e[_X], e[_Y]), len(self.monomials))
-                        factor = p.factor * q.factor * channel_noise(sampling, columns, p.channel, tuple(e)) * others
-                        found[r, c, monomial] = found.get((r, c, monomial), 0.0) + factor
+        for r, c, (x, y), factor in noise_terms(self.request.columns, self.request.sampling, ("x", "y")):
+            monomial = self.monomials.setdefault((x, y), len(self.monomials))
+            found[r, c, monomial] = found.get((r, c, monomial), 0.0) + factor
         return [(*term, factor) for term, factor in found.items()]
 
     @cached_property

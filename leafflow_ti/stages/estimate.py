@@ -117,7 +117,7 @@ class EstimateStage:
             steps.append(_Step(stage, which, tables, "fit" if fits else "solve", anew))
 
         def solve(tables: int) -> None:
-            for move in ESTIMATORS[problem.estimator].moves(problem.solver):
+            for move in ESTIMATORS[problem.estimator].moves(problem.solver, problem.cut):
                 add(move.stage, move.which, tables + self._tables.raw if move.raw else tables, move.anew)
             add(Stage.CLEAN, tables=tables)
 
@@ -153,12 +153,12 @@ class EstimateStage:
 
     def _launches(self) -> list[tuple[Any, int, int, str]]:
         """Kernel, first step, end, and part of what is launched for a batch."""
-        from leafflow_ti.kernels.stages import stage_kernel
+        from leafflow_ti.kernels.stages import stage_kernel, stages_kernel
 
-        spec, steps = self.device.dense, self._steps
+        spec, steps = replace(self.device.dense, cut=self._tables.layout.mask > 0), self._steps
         if self.device.gpu:
             return [(stage_kernel(spec, Stage(s.stage)), i, i + 1, s.part) for i, s in enumerate(steps)]
-        kernel = stage_kernel(spec, reweighted=ESTIMATORS[self.problem.estimator].weighs)
+        kernel = stages_kernel(spec, Stage(max(s.stage for s in steps)))
         if not self.apart:
             return [(kernel, 0, len(steps), "estimate")]
         runs, first = [], 0

@@ -24,6 +24,7 @@ from leafflow_ti.sampling import (
 )
 from leafflow_ti.stages.cells import Cells, SourcePlanes
 from leafflow_ti.stages.estimators import ESTIMATORS
+from leafflow_ti.stages.mask_moments import CutTables
 from leafflow_ti.stages.problem import BRIGHTNESS_MAPS, OwnFlows, Problem
 from leafflow_ti.stages.windows import taps
 
@@ -50,8 +51,8 @@ STEP_SIZE = {"f64": 1e-7, "f32": 3e-3}
 """Relative step of the forward differences of the motion rows: about the root of the rounding."""
 MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
 """Least energy of the gradient relative to that of the image, (8 eps)²: below, it is the rounding of a constant."""
-MIN_MASS = 0.2
-"""Least share of the window's weight that must lie inside the images (a corner pixel has 1/4)."""
+MIN_MASS = 0.1
+"""Least share of the window's weight that must be seen: a corner pixel has 1/4, less what the filters take."""
 LEAST_SHARE = 5e-5
 """Share of the gradient's mean energy in a direction that is no texture, however little noise there is: what filters
 and rounding leave."""
@@ -152,6 +153,7 @@ class ProblemTables:
         planes += [len(TensorLayout.of(own.columns).entries) + EXTRA_PLANES] * len(own.steps) if own else []
         self._first_plane = np.cumsum([0, *planes]).tolist()
         self._estimator = ESTIMATORS[problem.estimator]
+        self._mask = problem.mask_moments(layout)
         self._cells = [Cells(r) for r in problem.requests(layout)[:2]] if self._estimator.weighs else []
         self._sources = sources
         self.layout = Layout(
@@ -161,6 +163,7 @@ class ProblemTables:
             columns.n_flow if own and own.reference_rows else 0, Output.PLANES,
             max((len(c.sources) for c in self._cells), default=0),
             max((len(c.monomials) for c in self._cells), default=0), self._estimator.biased,
+            self._mask.n_planes if self._mask else 0, self._n_shapes,
         )  # fmt: skip
         self.reference = self._with_cells(self._reference_tables(rows, layout), 0)
         self.tables = [self.reference]
@@ -170,7 +173,7 @@ class ProblemTables:
             self._set_unknowns(final.number, own.unknowns, own.growth)
             self.tables += [final, *self._own_tables(own)]
         self.raw = len(self.tables)
-        if any(move.raw for move in self._estimator.moves(problem.solver)):
+        if any(move.raw for move in self._estimator.moves(problem.solver, problem.cut)):
             self.tables += [
                 Tables(t.number.copy(), self._unscaled(t.value, c))
                 for t, c in zip(self.tables, self._owners(), strict=True)
@@ -269,7 +272,30 @@ class ProblemTables:
         # Windows that do not overlap from one frame to the next share no content that could be followed.
         value[Value.MAX_SHIFT] = min(sampling.x.size, sampling.y.size)
         value[Value.DENOISE] = DENOISE[problem.estimator]
-        return Tables(number, value)
+        return self._with_cut(Tables(number, value), columns, sampling)
+
+    @property
+    def _n_shapes(self) -> int:
+        """Most shapes of columns of any data vector, where windows may be cut."""
+        if not self._mask:
+            return 0
+        own = self.problem.own_flows
+        columns = [self.problem.columns, *([own.columns] if own else [])]
+        return max(len(CutTables(c, self.problem.sampling, self._mask).shapes) for c in columns)
+
+    def _with_cut(self, tables: Tables, columns: ColumnSet, sampling: Sampling) -> Tables:
+        """The same tables, and what takes the place of the moments of whole windows where they are cut."""
+        self._set_numbers(tables.number, MASK_PLANES=0)
+        if not self._mask:
+            return tables
+        cut = CutTables(columns, sampling, self._mask)
+        self._set_numbers(
+            tables.number, MASK_PLANES=self._mask.n_planes, MASK_PLANE=self._first_plane[-1],
+            CURVED_BASIS=3 if self._mask.affine else 1, SHAPES=len(cut.shapes), CUT_NOISES=len(cut.noises),
+            CUT_PRODUCTS=len(cut.products), CUT_LISTS=len(tables.number), CUT_VALUES=len(tables.value),
+        )  # fmt: skip
+        number = np.concatenate([tables.number, np.array(cut.lists, np.int32)])
+        return Tables(number, np.concatenate([tables.value, cut.values]))
 
     def _reference_tables(self, rows: SimpleNamespace, layout: TensorLayout) -> Tables:
         from leafflow_ti.kernels.maps import Output

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from leafflow_ti.models import ColumnSet, TensorLayout
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.channels import Request
+from leafflow_ti.stages.estimators import ESTIMATORS
+from leafflow_ti.stages.mask_moments import MaskMoments
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class Problem:
     reference's rows (0: none), from which a fit with ``own_flows`` starts. ``range_scale``: of range flow, mm per px of
     (U', V') and of W. ``noise``: standard deviation of the images' noise, grey values, as far as it is known;
     ``scale``: of the coordinates in raw units (section 2.3.3); ``penalty`` and ``robust``: of robust estimators, how
-    residuals count and which pixels are estimated anew.
+    residuals count and which pixels are estimated anew. ``cut``: a mask or a border may cut windows, or pixels may be
+    invalid.
     """
 
     columns: ColumnSet
@@ -62,6 +65,7 @@ class Problem:
     scale: float = 1.0
     penalty: str = "geman-mcclure"
     robust: str = "failed"
+    cut: bool = False
 
     def about(self, frame: int) -> Problem:
         """The problem about the reference frame ``frame``: another one where frames are uneven in time."""
@@ -74,6 +78,12 @@ class Problem:
         """What the tensor stage is asked for: the reference model's tensor, and those of the own flows."""
         own = self.own_flows.requests if self.own_flows else ()
         return (Request(self.columns, layout, self.sampling), *own)
+
+    def mask_moments(self, layout: TensorLayout) -> MaskMoments | None:
+        """The moments of cut windows that are needed; estimators that weigh windows anew take those of cells."""
+        if not self.cut or ESTIMATORS[self.estimator].weighs:
+            return None
+        return MaskMoments.of(self.requests(layout))
 
     @property
     def unknowns(self) -> int:

@@ -21,6 +21,7 @@ from leafflow_ti.runtime import MOMENT_LANES, Device
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.cells import Cells, SourcePlanes
 from leafflow_ti.stages.channels import EXTRA_PLANES, FACTOR_PLANES, UNROLLED, Channels, Request
+from leafflow_ti.stages.mask_moments import MaskMoments
 from leafflow_ti.stages.planes import Terms
 from leafflow_ti.stages.tensor_tables import Band, Lowered, padded_tables
 from leafflow_ti.stages.windows import Windows, taps
@@ -35,9 +36,10 @@ TASKS = 32
 
 
 @functools.lru_cache(maxsize=4)
-def _tables(requests: tuple[Request, ...]) -> tuple[Channels, list[Windows]]:
-    """What does not depend on the band."""
-    return Channels(requests), [Windows(r, n) for n, r in enumerate(requests)]
+def _tables(requests: tuple[Request, ...], mask: MaskMoments | None) -> tuple[Channels, list[Windows]]:
+    """What does not depend on the band; the windows of the mask stand behind those of the requests."""
+    windows = [Windows(r, n) for n, r in enumerate(requests)]
+    return Channels(requests), windows + ([Windows(requests[0], 0, mask)] if mask else [])
 
 
 class TensorStage:
@@ -45,9 +47,10 @@ class TensorStage:
 
     ``push`` takes one frame's block [n_sy, n_sx, in_rows, in_cols] (preshifted) of the cameras that the sampling and
     the ``own`` requests need, and its validity. Once the window is full it returns ``tensors``, one flat
-    device array: the packed tensor [n_entries + EXTRA_PLANES, rows, out_pitch], then those of the own requests, then,
-    if ``weighed``, the ``sources`` of their cells; valid until the next call. For ``derived`` columns the block is a
-    stack of images [1, n_images, ...] with its factors.
+    device array: the packed tensor [n_entries + EXTRA_PLANES, rows, out_pitch], then those of the own requests, then
+    the moments of the ``mask`` (undefined while all pixels of the window's frames are valid), then, if ``weighed``, the
+    ``sources`` of their cells; valid until the next call. For ``derived`` columns the block is a stack of images
+    [1, n_images, ...] with its factors.
     """
 
     def __init__(
@@ -59,11 +62,12 @@ class TensorStage:
         band: Band,
         own: Sequence[Request] = (),
         weighed: bool = False,
+        mask: MaskMoments | None = None,
     ):
         self.device, self.band, self.sampling = device, band, sampling
         requests = (Request(columns, layout, sampling), *own)
-        lowered = Lowered(*_tables(requests), band, device.moments.lanes)
-        self._lowered = lowered
+        lowered = Lowered(*_tables(requests, mask), band, device.moments.lanes)
+        self._lowered, self._n_requests = lowered, len(requests)
         self.n_taps = sampling.t.taps
         geometry = lowered.geometry
         self.out_pitch = geometry.out_pitch
@@ -81,6 +85,7 @@ class TensorStage:
         self._clean_tables = self._tables_without_invalid(lowered)
         self._window_tables = [self._device_windows(w) for w in lowered.windows]
         self._spoilt = np.zeros(self.n_taps, bool)
+        self._cut = np.zeros(sampling.t.size, bool)
         self.reset()
 
     def _zeros(self, size: int) -> Any:
@@ -196,7 +201,8 @@ class TensorStage:
             if self.sampling.t.uneven:
                 self._set_windows(self._first + self._pushed - 1 - self.latency)
             for number in range(len(self._window_tables)):
-                self._make_tensor(number)
+                if number < self._n_requests or self._cut.any():
+                    self._make_tensor(number)
             for number in range(len(self._source_tables)):
                 self._make_sources(number)
         return self.tensors
@@ -238,6 +244,7 @@ class TensorStage:
     def _make_maps(self) -> None:
         """Filter the frames of the ring, and sum the products of the middle one over cameras and blocks."""
         slot = self._n_maps % self.sampling.t.size
+        self._cut[slot] = self._spoilt.any()
         if self.device.gpu:
             self._make_maps_by_planes(slot * self._lowered.slot_size)
         else:
@@ -375,11 +382,11 @@ def source_size(lowered: Lowered, cells: list[Cells]) -> int:
 @functools.lru_cache(maxsize=64)
 def band_bytes(
     columns: ColumnSet, layout: TensorLayout, sampling: Sampling, band: Band, itemsize: int,
-    own: tuple[Request, ...] = (), gpu: bool = False, weighed: bool = False,
+    own: tuple[Request, ...] = (), gpu: bool = False, weighed: bool = False, mask: MaskMoments | None = None,
 ) -> int:  # fmt: skip
     """Memory of the arrays of one band, from raw frames to output maps; a GPU keeps whole planes of every step."""
     requests = (Request(columns, layout, sampling), *own)
-    lowered = Lowered(*_tables(requests), band, 1 if gpu else MOMENT_LANES)
+    lowered = Lowered(*_tables(requests, mask), band, 1 if gpu else MOMENT_LANES)
     lanes = lowered.geometry.lanes
     output = OUTPUT_PLANES * band.rows * lowered.geometry.out_pitch
     sources = source_size(lowered, [Cells(r, n) for n, r in enumerate(requests)] if weighed else [])

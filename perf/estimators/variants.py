@@ -27,14 +27,14 @@ def replaced(name: str, estimator: Estimator) -> Iterator[None]:
         ESTIMATORS[name] = own
 
 
-def _from_raw(solver: str) -> list[Move]:
+def _from_raw(solver: str, cut: bool) -> list[Move]:
     """The fundamental scheme from total least squares at the local scale, instead of the equilibrated solution."""
-    own = FNS.moves(solver)
+    own = FNS.moves(solver, cut)
     behind = own[own.index(Move(Stage.BEGIN_WEIGHTS, Weights.NOISE)) :]
     return [Move(Stage.LOAD), *null_space(solver, raw=True), *behind]
 
 
-def _joint(solver: str) -> list[Move]:
+def _joint(solver: str, cut: bool) -> list[Move]:
     """Robust total least squares for all parameters from the plain fit on: no translation first, no narrow window."""
     again = (Move(Stage.REWEIGHT, Weights.PENALTY), *null_space(solver, whitened=True))
     return [
@@ -43,7 +43,7 @@ def _joint(solver: str) -> list[Move]:
     ]  # fmt: skip
 
 
-def _unnarrowed(solver: str) -> list[Move]:
+def _unnarrowed(solver: str, cut: bool) -> list[Move]:
     """The translation first, the derivatives second, in the whole window all the time."""
     first, full = (null_space(solver, which=which, whitened=True) for which in (1, 0))
     reweight = Move(Stage.REWEIGHT, Weights.PENALTY)

@@ -55,7 +55,7 @@ def window(images, sampling: Sampling, columns: ColumnSet, at, valid, cells):
 
     With J, ρ over the share of the window that is seen: by so much the variance of its residual is too small.
     """
-    rho = chain.texture_smoothness(images, sampling, *at)
+    rho = chain.texture_smoothness(images, sampling, *at, valid)
     if cells:
         return Cells.at(images, sampling, columns, at, valid), rho
     _, seen = chain.window_of(images, sampling, columns, at, valid)

@@ -7,10 +7,11 @@ Only the tables (columns, filters, noise factors) come from the library.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.ndimage import correlate1d, minimum_filter
 
 from leafflow_ti.models import AXES, ColumnSet
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio
+from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio, pixel_factor
 
 ARRAY_AXIS = {"t": 0, "sy": 1, "sx": 2, "y": 3, "x": 4}
 
@@ -150,19 +151,27 @@ def at_centre(P, cov, columns: ColumnSet):
     return T.T @ P, T.T @ cov @ T
 
 
-def texture_smoothness(images, sampling: Sampling, x, y):
-    """The factor ρ: energy of the reference camera's gradient smoothed once more in x and y, over its energy."""
+def texture_smoothness(images, sampling: Sampling, x, y, valid=None):
+    """The factor ρ: energy of the reference camera's gradient smoothed once more in x and y, over its energy.
+
+    Of pixels at which also the filters that smooth once more see what is ``valid`` [t, y, x] alone.
+    """
     middle = [sampling.axis(a).before for a in ("t", "sy", "sx")]
     h, w = sampling.y.size // 2, sampling.x.size // 2
     window = np.outer(sampling.y.weights, sampling.x.weights)
     energy = np.zeros(2)
+    seen = np.ones((len(images), *images.shape[3:]))
+    if valid is not None:
+        size = [sampling.t.taps, 2 * sampling.y.taps - 1, 2 * sampling.x.taps - 1]
+        seen = minimum_filter(valid.astype(float), size, mode="nearest", origin=[-1 + size[0] % 2, 0, 0])
     for channel in ("x", "y"):
         gradient = derivative(images, sampling, channel)[:, middle[1], middle[2]]
         for i, weight in enumerate(sampling.t.weights, start=middle[0] - sampling.t.size // 2):
             smooth = correlate1d(gradient[i], sampling.y.kernel(False), axis=0)
             smooth = correlate1d(smooth, sampling.x.kernel(False), axis=1)
             for k, image in enumerate((gradient[i], smooth)):
-                energy[k] += weight * np.sum(window * image[y - h : y + h + 1, x - w : x + w + 1] ** 2)
+                at = np.s_[y - h : y + h + 1, x - w : x + w + 1]
+                energy[k] += weight * np.sum(window * seen[i][at] * image[at] ** 2)
     return energy[1] / energy[0]
 
 
@@ -189,9 +198,11 @@ def coordinate_scales(columns: ColumnSet, scale):
 
 
 def noise_variance(J, P, columns: ColumnSet, noise):
-    """Image noise variance [k] that each solution's residual amounts to."""
+    """Image noise variance [k] that each solution's residual amounts to; ``noise``: covariance of the columns' noise,
+    or its diagonal."""
     full = np.vstack([P, np.eye(columns.n_time_like)])
-    return np.einsum("ik,ij,jk->k", full, J, full) / np.einsum("ik,i,ik->k", full, noise, full)
+    noise = np.diag(noise) if noise.ndim == 1 else noise
+    return np.einsum("ik,ij,jk->k", full, J, full) / np.einsum("ik,ij,jk->k", full, noise, full)
 
 
 def solution_noise(J, columns: ColumnSet, sampling: Sampling, solution):
@@ -209,7 +220,7 @@ class Solved:
     ``J`` [N, N]: the tensor, weighted where the estimator weighs; ``P`` [n_flow, k]; ``variance`` [k] of the noise that
     the residuals amount to; ``noise`` [N, N]: covariance of the columns' noise, of variance 1; ``rho``: the factor ρ.
     ``support``: mean weight where the window was weighted anew, at most 1; ``biased``: by the noise of all columns but
-    the time-like ones, towards 0.
+    the time-like ones, towards 0. Of a window that is cut also ``turn``, ``curved`` and ``centroid`` of ``cut.Cut``.
     """
 
     J: np.ndarray
@@ -219,12 +230,24 @@ class Solved:
     rho: float
     support: float = 1.0
     biased: bool = False
+    turn: np.ndarray | None = None
+    curved: np.ndarray | None = None
+    centroid: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
-        """By one of the estimators without weights, see ``solve``."""
-        noise = np.diag(column_noise(sampling, columns))
-        return cls(J, *solve(J, columns, sampling, estimator, scale), noise, rho, biased=estimator == "ols")
+    def of(cls, J, rho, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0, cut=None):
+        """By one of the estimators without weights, see ``solve``; ``cut``: of a window that is, its ``cut.Cut``.
+
+        ``rho``: the factor ρ over the share of the window that is seen.
+        """
+        noise = np.diag(column_noise(sampling, columns)) if cut is None else cut.noise
+        found = solve(J, columns, sampling, estimator, scale, None if cut is None else noise)
+        if cut is None:
+            return cls(J, *found, noise, rho, biased=estimator == "ols")
+        rho = rho * cut.share * cut.spread
+        return cls(
+            J, *found, noise, rho, biased=estimator == "ols", turn=cut.turn, curved=cut.curved, centroid=cut.centroid
+        )
 
     def clean(self, denoise):
         """J_ff less the share ``denoise`` of the noise of its own columns, at the variance of the quietest solution."""
@@ -244,6 +267,23 @@ class Solved:
             x = x + np.linalg.solve(J[:n, :n], held * x - J[:n, :n] @ x - J[:n, n])
         return (S[:n] * x / S[n])[:, None]
 
+    def solution_noise(self, columns: ColumnSet, sampling: Sampling, solution):
+        """As the function of this name. Of a cut window, centred squares of x and y are turned as they are; others as
+        in a whole one."""
+        found = solution_noise(self.J, columns, sampling, solution)
+        if self.turn is None:
+            return found
+        n, K = len(self.P), noise_ratio(sampling, columns, solution)[0]
+        powers = [c.terms[0].exponents[:2] for c in columns.columns[:n]]
+        square = np.array([max(e) > 1 for e in powers])
+        pixels = np.array([
+            [pixel_factor(sampling.x, p[0], q[0]) * pixel_factor(sampling.y, p[1], q[1]) for q in powers]
+            for p in powers
+        ])  # fmt: skip
+        centred = np.where(square[:, None] | square, 0.0, found - self.J[:n, :n] * K)
+        turned = self.turn @ self.J[:n, :n] @ self.turn.T
+        return turned * K * pixel_factor(sampling.x, 0, 0) * pixel_factor(sampling.y, 0, 0) / pixels + centred
+
     def covariances(self, columns: ColumnSet, sampling: Sampling, denoise):
         """Cov [k, k, n_flow, n_flow] between the parameters of each pair of solutions."""
         n, k = columns.n_flow, columns.n_time_like
@@ -253,7 +293,7 @@ class Solved:
             for j, two in enumerate(columns.solutions):
                 M = np.zeros((n, n))
                 if i == j:
-                    M = solution_noise(self.J, columns, sampling, one)
+                    M = self.solution_noise(columns, sampling, one)
                 else:
                     for term in cross_noise(sampling, columns, one, two):
                         M[term.a, term.b] = self.J[term.base_a, term.base_b] * term.value
@@ -275,14 +315,18 @@ def covariances(J, variances, columns: ColumnSet, sampling: Sampling, rho=1.0, d
     return solved.covariances(columns, sampling, denoise)
 
 
-def solve(J, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0):
+def solve(J, columns: ColumnSet, sampling: Sampling, estimator, scale=1.0, noise=None):
     """Parameters P [n_flow, k] of one of the estimators, and the noise variance [k] of their residuals.
 
-    ``scale``: see ``coordinate_scales``; of raw total least squares.
+    ``scale``: see ``coordinate_scales``; of raw total least squares. ``noise`` [N, N]: covariance of the columns' noise
+    where it is not that of a whole window.
     """
-    noise = column_noise(sampling, columns)
+    own, noise = noise is not None, column_noise(sampling, columns) if noise is None else noise
     if estimator == "ols":
         P = solutions_ols(J, columns)
+    elif own and estimator == "tls-equilibrated":
+        vectors = eigh(J, noise)[1][:, : columns.n_time_like]
+        P = vectors[: columns.n_flow] @ np.linalg.inv(vectors[columns.n_flow :])
     else:
         scales = noise**-0.5 if estimator == "tls-equilibrated" else coordinate_scales(columns, scale)
         P = solutions_tls(J, columns, scales)

@@ -1,7 +1,7 @@
 """Naive float64 twin of what follows the flow parameters: geometry, the fit of the motion, every map of a pixel."""
 
 import numpy as np
-from reference.chain import solution_noise, unsheared
+from reference.chain import unsheared
 
 from leafflow_ti.kernels.patch_fit import HELD
 from leafflow_ti.models import AXES, ColumnSet
@@ -47,12 +47,20 @@ def surface(x0, y0, f, nu, b1=0.0, b2=0.0):
     return Z0, c * p, c * q, c
 
 
-def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 0.0)):
+def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved=None, centroid=(0.0, 0.0)):
     """Design [rows, 10] by (N, Ω, A, ε) of the motion rows, linearised about the motion ``q`` for Ω × N (5.18).
 
     Rows run over the directions, then the offsets. The s-offsets are per camera step at the preshifted pixel.
-    ``moments`` (x, y): second moments of the window, of which the flow's own rows see the second derivatives.
+    ``curved`` [3, 3]: projections of x², xy, y² (columns) on 1, x, y over the window, by which these rows see the
+    flow's second-order part. ``centroid`` (x, y): of what the window sees, from the pixel; derivatives along s and t
+    are those there.
     """
+    if np.any(centroid):
+        x, y, plane, there, P = moved(x0, y0, f, geometry, q, centroid)
+        here = motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved)
+        away = about_point(motion_rows(x, y, f, plane, offsets, there, shift, baseline), P)
+        far = np.array([o in ("sx", "sy", "t") for _ in (0, 1) for o in offsets])
+        return np.where(far[:, None], away, here)
     nu, b1, b2 = geometry
     Z0, ZX, ZY, c = surface(x0, y0, f, nu, b1, b2)
     N = np.zeros(3)
@@ -79,7 +87,7 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 
         r = np.zeros(10)
         if o == "1":
             r[:3] = -nu * e[k]
-            return r + moments[k] / 2 * second_derivative(x0, y0, f, (Z0, ZX, ZY), k)
+            return r
         r[:3] = -b[o] * e[k]
         if (o, k) in (("x", 0), ("y", 1)):
             r[2] += nu / f
@@ -90,18 +98,26 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, moments=(0.0, 
             r[6:9] = -nu * e[k]
         return r
 
+    def projected(k, o):
+        # Along s nothing is bent: what is seen there is the derivative of the flow alone.
+        found = np.zeros(10)
+        for column, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+            half = 0.5 if i == j else 1.0
+            found += half * curved["1xy".index(o), column] * second_derivative(x0, y0, f, (Z0, ZX, ZY), k, i, j)
+        return found
+
     def measured(k, o):
         if o == "sx":
             return baseline[0] * row(k, "sx") + shift[0] * row(k, "x")
         if o == "sy":
             return baseline[1] * row(k, "sy") + shift[1] * row(k, "y")
-        return row(k, o)
+        return row(k, o) if curved is None or o == "t" else row(k, o) + projected(k, o)
 
     return np.array([measured(k, o) for k in (0, 1) for o in offsets])
 
 
-def second_derivative(x0, y0, f, plane, k):
-    """Coefficients [10] of (N, Ω, A, ε) of ∂²u_k/∂x_k² on the plane (Z0, ZX, ZY) at (x0, y0), by exact differences.
+def second_derivative(x0, y0, f, plane, k, i, j):
+    """Coefficients [10] of (N, Ω, A, ε) of ∂²u_k/∂x_i∂x_j on the plane (Z0, ZX, ZY) at (x0, y0), by exact differences.
 
     The flow of a rigidly moving plane is quadratic in x and y, so second differences of any width are exact.
     """
@@ -109,31 +125,65 @@ def second_derivative(x0, y0, f, plane, k):
     X0 = Z0 * np.array([x0 / f, y0 / f, 1.0])
 
     def flow(d, q):
-        x, y = (x0 + d, y0) if k == 0 else (x0, y0 + d)
-        ray = np.array([x / f, y / f, 1.0])
+        ray = np.array([(x0 + d[0]) / f, (y0 + d[1]) / f, 1.0])
         X = (Z0 - ZX * X0[0] - ZY * X0[1]) / (1 - ZX * ray[0] - ZY * ray[1]) * ray
         U = q[:3] + np.cross(q[3:6], X - X0) + q[9] * (X - X0)
         return f * (U[k] - ray[k] * U[2]) / X[2]
 
     h = 0.05 * f
-    return np.array([(flow(h, q) - 2 * flow(0, q) + flow(-h, q)) / h**2 for q in np.eye(10)])
+    one, two = h * np.eye(2)[i], h * np.eye(2)[j]
+    found = [sum(s * t * flow(s * one + t * two, q) for s in (1, -1) for t in (1, -1)) for q in np.eye(10)]
+    return np.array(found) / (4 * h**2)
 
 
-def range_row(x0, y0, f, geometry):
-    """Design [10] of the range constraint for b_t (5.23)."""
+def moved(x0, y0, f, geometry, q, by):
+    """Pixel, geometry and motion where the patch is seen ``by`` (x, y) px further; P from its point to there."""
+    nu, b1, b2 = geometry
+    x, y = x0 + by[0], y0 + by[1]
+    there = (nu + b1 * by[0] + b2 * by[1], b1, b2)
+    P = -f / there[0] * np.array([x / f, y / f, 1.0]) + f / nu * np.array([x0 / f, y0 / f, 1.0])
+    motion = np.array(q, float)
+    motion[:3] += np.cross(q[3:6], P) + q[9] * P
+    return x, y, there, motion, P
+
+
+def about_point(rows, P):
+    """Design [rows, 10] by the motion of the patch from that by the motion of its part at P."""
+    rows = rows.copy()
+    rows[:, 3:6] += np.cross(P, rows[:, :3])
+    rows[:, 9] += rows[:, :3] @ P
+    return rows
+
+
+def range_row(x0, y0, f, geometry, centroid=(0.0, 0.0)):
+    """Design [10] of the range constraint for b_t (5.23), which is that at the centroid of what is seen."""
+    if np.any(centroid):
+        x, y, there, _, P = moved(x0, y0, f, geometry, np.zeros(10), centroid)
+        row = about_point(range_row(x, y, f, there)[None], P)[0]
+        row[9] = 0.0  # growth moves points within the plane
+        return row
     Z0, ZX, ZY, c = surface(x0, y0, f, *geometry)
     r = np.zeros(10)
     r[:3] = f / (Z0**2 * c) * np.array([-ZX, -ZY, 1.0])
     return r
 
 
-def shared_covariance(J_own, P_inverse, own_inverse, columns, own_columns, sampling, own_sampling, step):
+def seen_of(solved, sampling):
+    """``curved`` and ``centroid`` of ``motion_rows`` for a solution; of a whole window its second moments."""
+    if solved.curved is not None:
+        return solved.curved, solved.centroid
+    whole = np.zeros((3, 3))
+    whole[0, 0], whole[0, 2] = sampling.x.moment(2), sampling.y.moment(2)
+    return whole, solved.centroid
+
+
+def shared_covariance(found_own, P_inverse, own_inverse, columns, own_columns, sampling, own_sampling, step):
     """Covariance [n_flow, n_flow of the own flow], per σ² ρ, of the motion parameters of grid and camera.
 
     The grid's normal equations hold the image of the camera at ``step`` with the weights of window and smoothing.
     """
     n, m = columns.n_flow, own_columns.n_flow
-    noise = solution_noise(J_own, own_columns, own_sampling, "t")
+    noise = found_own.solution_noise(own_columns, own_sampling, "t")
     X = np.zeros((n, m))
     for a, column in enumerate(columns.columns[:n]):
         factor = 1.0
@@ -173,7 +223,6 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
     columns, sampling, f = problem.columns, problem.sampling, view.f_px
     shift, baseline = view.shift_px, view.baseline_mm
     names, g, cov_g, cross_g = geometry
-    moments = sampling.x.moment(2), sampling.y.moment(2)
     surface_terms = np.zeros(3)
     surface_terms[: min(3, len(g))] = g[:3]
     k = columns.solutions.index("t")
@@ -210,8 +259,8 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
             codes.append("range")
 
         def design(geometry, q):
-            A = motion_rows(x0, y0, f, geometry, problem.offsets, q, shift, baseline, moments)
-            return np.vstack([A, range_row(x0, y0, f, geometry)]) if problem.use_range else A
+            A = motion_rows(x0, y0, f, geometry, problem.offsets, q, shift, baseline, *seen_of(solved, sampling))
+            return np.vstack([A, range_row(x0, y0, f, geometry, solved.centroid)]) if problem.use_range else A
 
         return rows_of(value, C, shared, design, codes, problem.use_range, q), rows
 
@@ -222,7 +271,7 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
         C = C[0, 0]
         rows = [flows.columns.index(d, o) for d in ("x", "y") for o in flows.offsets]
         E = np.eye(flows.columns.n_flow)[rows]
-        moved = [place[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)]
+        moved = np.array([place[i] * (g[0] * baseline[i] - shift[i]) for i in (0, 1)])
         for r, (d, o) in enumerate((d, o) for d in ("x", "y") for o in flows.offsets):
             if o == "1":
                 for axis, distance in zip(("x", "y"), moved, strict=True):
@@ -233,13 +282,15 @@ def fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own=()):
             Z0, ZX, ZY, _ = surface(x0, y0, f, *geometry)
             c = 1 - ZX * x / f - ZY * y / f
             there = (-f / Z0, ZX / (Z0 * c), ZY / (Z0 * c))
-            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, moments)
+            curved, centroid = seen_of(found_own, sampling)
+            curved = np.vstack([curved[0] + moved @ curved[1:], curved[1:]])
+            return motion_rows(x, y, f, there, flows.offsets, q, shift, baseline, curved, centroid)
 
         codes = [*flows.offsets, *flows.offsets]
         found = rows_of(E @ p[:, 0], E @ C @ E.T, np.zeros((len(g), len(rows))), design, codes, False, q)
         own_inverse = np.linalg.inv(found_own.clean(denoise))
         shared = shared_covariance(
-            found_own.J, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
+            found_own, inverse, own_inverse, columns, flows.columns, sampling, flows.sampling, step
         ) * (found_own.rho * np.sqrt(solved.variance[k] * s2[0]))
         shared = unsheared(columns, view.motion_px) @ shared @ unsheared(flows.columns, view.motion_px).T
         return found, shared @ E.T

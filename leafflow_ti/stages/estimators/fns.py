@@ -12,7 +12,7 @@ ROUNDS = 6
 """Measured as for Sampson's scheme, the sixth changes the solution by less than a millionth of its standard error."""
 
 
-def _moves(solver: str) -> list[Move]:
+def _moves(solver: str, cut: bool) -> list[Move]:
     begin = [Move(Stage.LOAD), *null_space(solver), Move(Stage.BEGIN_WEIGHTS, Weights.NOISE)]
     step = (Move(Stage.FUNDAMENTAL, raw=True), Move(Stage.PARAMETERS, raw=True))
     again = rounds(ROUNDS, Move(Stage.REWEIGHT, Weights.FUNDAMENTAL), *step)

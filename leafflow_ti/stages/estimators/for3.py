@@ -13,7 +13,7 @@ ROUNDS = 3
 it by less than a thousandth of its standard error."""
 
 
-def _moves(solver: str) -> list[Move]:
+def _moves(solver: str, cut: bool) -> list[Move]:
     begin = [Move(Stage.LOAD), *null_space(solver), Move(Stage.BEGIN_WEIGHTS, Weights.NOISE)]
     again = rounds(ROUNDS, Move(Stage.REWEIGHT, Weights.NOISE), *null_space(solver, whitened=True))
     return [*begin, *again, *finished(factored=False)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from leafflow_ti.kernels.numbers import Stage, Weights
 
-__all__ = ["Estimator", "Move", "Stage", "Weights", "finished", "null_space", "rounds"]
+__all__ = ["Estimator", "Move", "Stage", "Weights", "equilibrated", "finished", "null_space", "rounds"]
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Move:
 
 @dataclass(frozen=True)
 class Estimator:
-    """``moves``: a function of the solver ("fast" or "jacobi"). They leave parameters, residual variances and the
-    factor of the equilibrated tensor in the workspace.
+    """``moves``: a function of the solver ("fast" or "jacobi"), and of whether windows may be cut. They leave
+    parameters, residual variances and the factor of the equilibrated tensor in the workspace.
 
     ``biased``: the noise of the columns pulls solutions towards 0, which counts among their errors.
     ``weighs``: windows are weighted anew; ``robust``: by their residuals. ``denoise``: share of the gradients' own
@@ -33,7 +33,7 @@ class Estimator:
     it leaves the matrix definite where there is nothing else, and makes the standard errors there ten times larger.
     """
 
-    moves: Callable[[str], list[Move]]
+    moves: Callable[[str, bool], list[Move]]
     weighs: bool = False
     denoise: float = 0.9
     robust: bool = False
@@ -60,7 +60,21 @@ def rounds(number: int, *moves: Move) -> list[Move]:
     return [replace(move, anew=True) for move in moves] * number
 
 
-def finished(factored: bool) -> list[Move]:
-    """Residuals and the values at the window's centre; on the equilibrated tensor, unless it is ``factored``."""
+def equilibrated(solver: str, cut: bool) -> list[Move]:
+    """The k smallest eigenvectors of ``C^-1/2 J C^-1/2``; of ``cut`` windows those of J against the noise of its
+    columns. The equilibrated tensor is left factored."""
+    found = [Move(Stage.LOAD), *null_space(solver)]
+    if cut:
+        anew = rounds(1, *null_space(solver, whitened=True), Move(Stage.SCALE), Move(Stage.FACTORISE))
+        found += [Move(Stage.CUT_WINDOWS), *anew]
+    return found
+
+
+def finished(factored: bool, cut: bool = False) -> list[Move]:
+    """Residuals and the values at the window's centre; on the equilibrated tensor, unless it is ``factored``.
+
+    ``cut``: windows may be, which nothing before has looked at.
+    """
     again = [] if factored else [Move(Stage.SCALE), Move(Stage.FACTORISE)]
+    again += [Move(Stage.CUT_WINDOWS)] if cut else []
     return [*again, Move(Stage.RESIDUALS), Move(Stage.CENTRE)]

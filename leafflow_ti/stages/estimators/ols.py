@@ -12,8 +12,8 @@ def least_squares(which: int = 0) -> list[Move]:
     return [Move(stage, which) for stage in stages]
 
 
-def _moves(solver: str) -> list[Move]:
-    return [Move(Stage.LOAD), *least_squares(), *finished(factored=True)]
+def _moves(solver: str, cut: bool) -> list[Move]:
+    return [Move(Stage.LOAD), *least_squares(), *finished(factored=True, cut=cut)]
 
 
 OLS = Estimator(_moves, denoise=0.0, biased=True)

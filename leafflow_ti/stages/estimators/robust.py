@@ -35,18 +35,18 @@ def _graduated(weights: Weights, start: list[Move], first: list[Move], full: lis
     ]  # fmt: skip
 
 
-def _ols(solver: str) -> list[Move]:
+def _ols(solver: str, cut: bool) -> list[Move]:
     """Iteratively reweighted least squares."""
     return _graduated(Weights.PENALTY_PLAIN, least_squares(), least_squares(which=1), least_squares())
 
 
-def _sor(solver: str) -> list[Move]:
+def _sor(solver: str, cut: bool) -> list[Move]:
     """Successive over-relaxation: the derivatives start at the translation."""
     sweeps = [Move(Stage.SCALE), Move(Stage.RELAX, SWEEPS)]
     return _graduated(Weights.PENALTY_PLAIN, least_squares(), least_squares(which=1), sweeps)
 
 
-def _tls(solver: str) -> list[Move]:
+def _tls(solver: str, cut: bool) -> list[Move]:
     first, full = (null_space(solver, which=which, whitened=True) for which in (1, 0))
     return _graduated(Weights.PENALTY, null_space(solver), first, full)
 

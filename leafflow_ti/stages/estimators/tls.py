@@ -6,17 +6,16 @@ their units.
 
 from __future__ import annotations
 
-from leafflow_ti.stages.estimators.moves import Estimator, Move, Stage, finished, null_space
+from leafflow_ti.stages.estimators.moves import Estimator, Move, Stage, equilibrated, finished, null_space
 
 
-def _equilibrated(solver: str) -> list[Move]:
-    """The k smallest eigenvectors of ``C^-1/2 J C^-1/2``."""
-    return [Move(Stage.LOAD), *null_space(solver), *finished(factored=True)]
+def _equilibrated(solver: str, cut: bool) -> list[Move]:
+    return [*equilibrated(solver, cut), *finished(factored=True)]
 
 
-def _raw(solver: str) -> list[Move]:
+def _raw(solver: str, cut: bool) -> list[Move]:
     """The k smallest eigenvectors of J itself; depends on the units of the columns (section 2.3.3)."""
-    return [Move(Stage.LOAD), *null_space(solver, raw=True), *finished(factored=False)]
+    return [Move(Stage.LOAD), *null_space(solver, raw=True), *finished(factored=False, cut=cut)]
 
 
 TLS_EQUILIBRATED = Estimator(_equilibrated)
