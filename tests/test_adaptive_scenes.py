@@ -93,6 +93,8 @@ def test_status_of_leaves(measured: lf.Field) -> None:
     assert np.isin(measured.status, HAS_VALUE)[leaf].mean() > 0.95
     assert 0.02 < (measured.status == Status.CONTESTED)[leaf].mean() < 0.25
     coarse = measured.status == Status.COARSE
+    # Where others hide a leaf from most images the refinement takes those that are left.
+    assert coarse[leaf].mean() < 0.03
     assert np.isfinite(measured["depth"][coarse]).all()
     assert np.isnan(measured["depth_std"][coarse]).all()
 
