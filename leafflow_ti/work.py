@@ -26,9 +26,9 @@ from leafflow_ti.plan import Plan
 from leafflow_ti.sampling import AxisSampling, Sampling, cross_noise
 from leafflow_ti.stages.cells import Cells
 from leafflow_ti.stages.channels import Request
-from leafflow_ti.stages.estimate_tables import GUARDED
 from leafflow_ti.stages.estimators import ESTIMATORS, Move
 from leafflow_ti.stages.problem import Problem
+from leafflow_ti.stages.thresholds import GUARDED
 
 Key = tuple[Any, ...]
 STAGES = ("filter", "tensor", "solve", "fit")

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from leafflow_ti.field import MOTION_NAMES
 from leafflow_ti.plan import Plan
 from leafflow_ti.sampling import column_noise, cross_noise, noise_ratio
-from leafflow_ti.stages.estimate_tables import DENOISE, MODEL_ERROR, TURNING_ERROR
 from leafflow_ti.stages.problem import Problem
+from leafflow_ti.stages.thresholds import DENOISE, MODEL_ERROR, TURNING_ERROR
 
 Array = NDArray[np.float64]
 Maps = dict[str, Array]

@@ -20,9 +20,9 @@ from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan
 from leafflow_ti.refine_plan import Refinement
 from leafflow_ti.runtime import Device
-from leafflow_ti.stages.estimate_tables import View
 from leafflow_ti.stages.refine import RefineStage
 from leafflow_ti.stages.refine_tables import CPU_BYTES, SLOTS_PER_THREAD, Workspaces
+from leafflow_ti.stages.view import View
 
 LANES = 16
 WIDE = replace(SCENE, size=(150, 130))

@@ -16,7 +16,7 @@ from tolerances import tolerance
 import leafflow_ti as lf
 from leafflow_ti.capture import Geometry, capture_from_array
 from leafflow_ti.models import MODELS
-from leafflow_ti.stages.estimate_tables import DENOISE
+from leafflow_ti.stages.thresholds import DENOISE
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import PlaneScene, render, truth
 

@@ -20,9 +20,9 @@ from tolerances import tolerance
 from leafflow_ti.filters import filter_set
 from leafflow_ti.models import MODELS, column_set
 from leafflow_ti.sampling import AxisSampling, Sampling
-from leafflow_ti.stages.estimate_tables import DENOISE
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.tensor import Band
+from leafflow_ti.stages.thresholds import DENOISE
 from leafflow_ti.status import Status
 
 PIXELS = ((0, 0), (1, 3), (2, 4))

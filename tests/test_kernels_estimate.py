@@ -11,7 +11,7 @@ from reference import chain, patch
 from tolerances import SOLVERS, tolerance
 
 from leafflow_ti.models import MODELS
-from leafflow_ti.stages.estimate_tables import DENOISE
+from leafflow_ti.stages.thresholds import DENOISE
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import truth
 

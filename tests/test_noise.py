@@ -15,7 +15,7 @@ from reference.sequences import affine_sequence
 import leafflow_ti as lf
 from leafflow_ti.capture import capture_from_array
 from leafflow_ti.models import MODELS, column_set
-from leafflow_ti.stages.estimate_tables import DENOISE
+from leafflow_ti.stages.thresholds import DENOISE
 from leafflow_ti.status import Status
 
 SCENE = replace(

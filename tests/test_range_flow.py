@@ -34,10 +34,10 @@ from leafflow_ti.progress import Progress
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import AxisSampling, Sampling
 from leafflow_ti.stages.estimate import EstimateStage, View
-from leafflow_ti.stages.estimate_tables import DENOISE
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import Problem
 from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, TensorStage
+from leafflow_ti.stages.thresholds import DENOISE
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic import cube
 from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render

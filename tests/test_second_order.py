@@ -17,7 +17,7 @@ from leafflow_ti.capture import Geometry, capture_from_array
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.filters import filter_set
 from leafflow_ti.models import MODELS, column_set
-from leafflow_ti.stages.estimate_tables import DENOISE
+from leafflow_ti.stages.thresholds import DENOISE
 from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
 
 GRID = {"reference": "single", "line": "line-x", "grid": "square"}

@@ -14,9 +14,10 @@ from leafflow_ti.kernels.numbers import Stage
 from leafflow_ti.models import TensorLayout
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.cells import SourcePlanes
-from leafflow_ti.stages.estimate_tables import ProblemTables, View
+from leafflow_ti.stages.estimate_tables import ProblemTables
 from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.problem import Problem
+from leafflow_ti.stages.view import View
 from leafflow_ti.trace import span
 
 __all__ = ["EstimateStage", "View"]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from leafflow_ti.refine_plan import Effort, Refinement
 from leafflow_ti.runtime import Device
 from leafflow_ti.splines import filter_radius, filter_taps
-from leafflow_ti.stages.estimate_tables import View
 from leafflow_ti.stages.planes import Filtering, round_up
 from leafflow_ti.stages.refine_tables import RefineTables, Workspaces
+from leafflow_ti.stages.view import View
 from leafflow_ti.trace import span
 
 Array = NDArray[Any]

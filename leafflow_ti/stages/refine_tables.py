@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.refine_plan import PIXEL_VARIANCE, Refinement
 from leafflow_ti.splines import PREFILTER_SIGMA, filter_radius, filter_taps, spline, spline_pieces, support
-from leafflow_ti.stages.estimate_tables import View
+from leafflow_ti.stages.view import View
 
 Array = NDArray[Any]
 

@@ -16,7 +16,7 @@ from reference.cells import Cells
 from scipy.linalg import eigh
 
 from leafflow_ti.models import ColumnSet
-from leafflow_ti.stages import estimate_tables as tables
+from leafflow_ti.stages import thresholds as tables
 from leafflow_ti.stages.cells import NARROW
 from leafflow_ti.stages.estimators import fns as fns_stages
 from leafflow_ti.stages.estimators import for3 as for3_stages

@@ -6,8 +6,8 @@ from reference.chain import unsheared
 from leafflow_ti.kernels.patch_fit import HELD
 from leafflow_ti.models import AXES, ColumnSet
 from leafflow_ti.sampling import difference_variance
-from leafflow_ti.stages.estimate_tables import DENOISE, MAX_CONTRADICTION, MODEL_ERROR, TURNING_ERROR
 from leafflow_ti.stages.estimators import ESTIMATORS
+from leafflow_ti.stages.thresholds import DENOISE, MAX_CONTRADICTION, MODEL_ERROR, TURNING_ERROR
 
 
 def fit_geometry(P, cov, columns: ColumnSet, baseline, shift, weighted=True):
