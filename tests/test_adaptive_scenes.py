@@ -145,7 +145,7 @@ def test_no_seams_at_tiles_and_labels() -> None:
         across, down = np.diff(error, axis=1), np.diff(error, axis=0)
         seams = np.arange(1, down.shape[0] + 1) % tile == 0
         found = [float(np.sqrt(np.nanmean(d**2))) for d in (down[seams], down[~seams], across[border], across[~border])]
-        assert 0.75 < found[0] / found[1] < 1.33, name
+        assert found[0] < 1.33 * found[1], name  # three rows of steps: their rms scatters by .2; a seam only adds
         assert found[2] < 2.0 * found[3], name
 
 

@@ -44,7 +44,8 @@ def measured(capture: FileCapture, plan: Plan, aim: Aim) -> tuple[dict[str, floa
     stay = pipeline.stays.move(pipeline.engine(band), band, (X, Y), aim, frames.start, FRAME)
     samples = []
     for t, block in zip(frames, pipeline.reader.blocks(frames, stay.box, aim, FRAME), strict=True):
-        sample, tensors = pipeline.stays.push(stay, t, *block)
+        sample = pipeline.stays.sample(stay, t, *block)
+        tensors = stay.engine.push(sample)
         samples.append(without_images(sample))
     stay.engine.set_frame(FRAME)
     maps, status = pipeline.stays.maps(stay, tensors, samples[sampling.t.before])
