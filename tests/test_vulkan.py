@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import test_cut_windows
 import test_estimators
 import test_kernels_tensor
 import test_range_flow
@@ -64,7 +65,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 10} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 11} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -162,6 +163,11 @@ def on_vulkan_the_refinement_equals_the_twin(device: Callable) -> None:
     assert holed[0].converged.all()
     np.testing.assert_array_equal(holed[0].parameters, holed[1].parameters)
     assert (holed[0].parameters != found.parameters).any()
+
+
+def on_vulkan_cut_windows_equal_the_twin(bench: Callable) -> None:
+    b = test_cut_windows.masked(bench("affine-4d", "spatial", "line-y", "f32"), "corner")
+    test_cut_windows.assert_parameters_equal(b, "tls-equilibrated", ("fast",))
 
 
 def on_vulkan_what_is_hidden_equals_naive_loops(device: Callable) -> None:
