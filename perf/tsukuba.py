@@ -35,7 +35,7 @@ GOAL = 85.0
 class Settings:
     """Options of ``estimate``; ``refined``: those of a second measurement, beside the first ones."""
 
-    window: int = 29
+    window: int = 35
     stride: int = 1
     refined: tuple[tuple[str, Any], ...] = (("window", 11), ("refine", 5), ("refine_window", 11), ("thin", 1))
 

@@ -28,9 +28,8 @@ STEP_SIZE = {"f64": 1e-7, "f32": 3e-3}
 """Relative step of the forward differences of the motion rows: about the root of the rounding."""
 MIN_STRUCTURE = {"f64": 8e-31, "f32": 2e-13}
 """Least energy of the gradient relative to that of the image, (8 eps)²: below, it is the rounding of a constant."""
-MIN_MASS = 0.2
-"""Least share of the window's weight that must be seen (a corner pixel has 1/4): values of less are worse than the
-search's own (Tsukuba)."""
+MIN_MASS = 0.1
+"""Least share of the window's weight that must be seen: a corner pixel has 1/4, less what the filters take."""
 LEAST_SHARE = 5e-5
 """Share of the gradient's mean energy in a direction that is no texture, however little noise there is: what filters
 and rounding leave."""
