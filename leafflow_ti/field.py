@@ -57,6 +57,19 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "strain_rate_11": ("%/frame", "strain rate in the surface along its tangent in the plane of X and Z"),
     "strain_rate_22": ("%/frame", "strain rate in the surface at right angles to that tangent"),
     "strain_rate_12": ("%/frame", "shear strain rate in the surface, between the two"),
+    "principal_rate_1": ("%/frame", "largest strain rate in the surface"),
+    "principal_rate_2": ("%/frame", "smallest strain rate in the surface"),
+    "principal_angle": ("rad", "direction of the largest strain rate, from the tangent in the plane of X and Z"),
+    "area_rate": ("%/frame", "relative growth rate of the surface area, from the motion in a window"),
+    "surface_strain_11": ("%/frame", "Lagrangian strain in the surface along its tangent in the plane of X and Z"),
+    "surface_strain_22": ("%/frame", "Lagrangian strain in the surface at right angles to that tangent"),
+    "surface_strain_12": ("%/frame", "Lagrangian shear strain in the surface, between the two"),
+    "surface_principal_1": ("%/frame", "largest Lagrangian strain in the surface"),
+    "surface_principal_2": ("%/frame", "smallest Lagrangian strain in the surface"),
+    "surface_angle": ("rad", "direction of the largest Lagrangian strain, from the tangent in the plane of X and Z"),
+    "velocity_correlation_xy": ("1", "correlation of the errors of the velocity along X and Y"),
+    "velocity_correlation_xz": ("1", "correlation of the errors of the velocity along X and Z"),
+    "velocity_correlation_yz": ("1", "correlation of the errors of the velocity along Y and Z"),
     "confidence": ("1", "confidence in the estimate, 0 to 1"),
     "support": ("1", "share of the window that a robust estimate rests on, 1 where the plain fit did not fail"),
     "identified": ("1", "groups of parameters that the texture determines"),
@@ -64,7 +77,9 @@ QUANTITIES: dict[str, tuple[str, str]] = {
 """Name of a map -> (unit, long name). Every map may have a companion ``NAME_std``, its standard error, but for those
 ``WITHOUT_STD``."""
 
-WITHOUT_STD = ("confidence", "support", "identified")
+CORRELATIONS = ("velocity_correlation_xy", "velocity_correlation_xz", "velocity_correlation_yz")
+"""Maps of the correlations between the errors of the velocity's components."""
+WITHOUT_STD = (*CORRELATIONS, "confidence", "support", "identified")
 IDENTIFIED: dict[str, int] = {
     name: 1 << bit
     for bit, name in enumerate(
@@ -77,6 +92,14 @@ MOTION_NAMES = tuple(f"{q}_{a}" for q in ("velocity", "rotation", "acceleration"
 """Maps of the unknowns (N, Ω, A)."""
 STRAIN_NAMES = ("strain_rate_11", "strain_rate_22", "strain_rate_12")
 """Maps of the strain rates in the surface, which add up to the growth rate: 11 + 22."""
+PRINCIPAL_NAMES = ("principal_rate_1", "principal_rate_2", "principal_angle")
+"""Maps of the principal axes of these strain rates."""
+SURFACE_STRAIN_NAMES = ("surface_strain_11", "surface_strain_22", "surface_strain_12")
+"""Maps of the strain in the surface that follows from the motion around a pixel, not from its window's texture."""
+SURFACE_PRINCIPAL_NAMES = ("surface_principal_1", "surface_principal_2", "surface_angle")
+"""Maps of the principal axes of that strain."""
+SURFACE_NAMES = ("area_rate", *SURFACE_STRAIN_NAMES, *SURFACE_PRINCIPAL_NAMES)
+"""All maps that follow from the motion around a pixel."""
 FLOW_GRADIENT_NAMES = ("flow_xx", "flow_xy", "flow_yx", "flow_yy")
 """Maps of the flow's derivatives in one camera, component by component."""
 PLANE_STRAIN_NAMES = ("strain_xx", "strain_yy", "strain_xy")

@@ -109,20 +109,7 @@ class ResultStore:
                     times = np.asarray(times_s, np.float64)
                     group.create_array("time", data=times, dimension_names=["t"], attributes=_TIME)
                 for name in (*names, "status"):
-                    attributes = map_attributes(name)
-                    if f"{name}_std" in names:
-                        attributes["ancillary_variables"] = f"{name}_std status"
-                    group.create_array(
-                        name,
-                        shape=shape,
-                        chunks=chunk,
-                        dtype=empty_map(name, ()).dtype,
-                        fill_value=empty_map(name, ()).item(),
-                        dimension_names=list(coordinates),
-                        attributes=attributes,
-                        compressors=_COMPRESSOR,
-                        filters=None,
-                    )
+                    _create_map(group, name, f"{name}_std" in names, shape, chunk)
                 (scratch / "status" / ".done").mkdir()
                 if path.exists():
                     shutil.rmtree(path)
@@ -261,15 +248,56 @@ class ResultStore:
         maps = {name: self.read(name, t_index) for name in self.names}
         return Field(maps, self.read("status", t_index), self.y, self.x, self.frames[t_index], self.attrs)
 
+    def add_maps(self, names: Sequence[str], attrs: Mapping[str, Any]) -> ResultStore:
+        """The store with further maps, empty (those it has lose their values), to be filled by ``write_map``.
+
+        For what follows from the measured maps; ``attrs`` say how. Raises RunError when units are missing or the store
+        cannot be written.
+        """
+        self._check_whole()
+        array = self._arrays["status"]
+        with _writing(self.path):
+            for name in names:
+                _create_map(self._group, name, f"{name}_std" in names, array.shape, array.chunks)
+        self.update_attrs(attrs)
+        return ResultStore.open(self.path)
+
+    def write_map(self, name: str, t_index: int, values: NDArray[Any]) -> None:
+        """Write a map ``[y, x]`` of the frame with index ``t_index`` along t; RunError when that is impossible."""
+        if values.shape != (self.y.size, self.x.size):
+            raise ValueError(f"{name} needs the shape {(self.y.size, self.x.size)}; got {values.shape}")
+        with _writing(self.path):
+            for band in range(self.bands):
+                self._write_chunk(t_index, band, name, values[band * self.unit_rows : (band + 1) * self.unit_rows])
+
+    def _check_whole(self) -> None:
+        missing = self.n_units - len(self.done())
+        if missing:
+            raise RunError(f"{self.path}: {missing} of {self.n_units} units are not done: run again with --resume")
+
     def finish(self, attrs: Mapping[str, Any]) -> None:
         """Set the attributes known at the end.
 
         Raises RunError when units are missing or the store cannot be written.
         """
-        missing = self.n_units - len(self.done())
-        if missing:
-            raise RunError(f"{self.path}: {missing} of {self.n_units} units are not done: run again with --resume")
+        self._check_whole()
         self.update_attrs(attrs)
+
+
+def _create_map(group: zarr.Group, name: str, has_std: bool, shape: tuple[int, ...], chunk: tuple[int, ...]) -> None:
+    attributes = map_attributes(name) | ({"ancillary_variables": f"{name}_std status"} if has_std else {})
+    group.create_array(
+        name,
+        shape=shape,
+        chunks=chunk,
+        dtype=empty_map(name, ()).dtype,
+        fill_value=empty_map(name, ()).item(),
+        dimension_names=list(_COORDINATES),
+        attributes=attributes,
+        compressors=_COMPRESSOR,
+        filters=None,
+        overwrite=True,
+    )
 
 
 def _open_group(path: Path) -> zarr.Group | None:

@@ -14,6 +14,7 @@ import zarr
 
 from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
 from leafflow_ti.field import QUANTITIES, Field, map_attributes, quantity
+from leafflow_ti.rates import per_hour
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 
@@ -220,6 +221,43 @@ def test_finish_adds_attributes_when_all_is_done(tmp_path: Path, full: ResultSto
     assert ResultStore.open(full.path).attrs == {**full.attrs, "device": "cpu", "run": {"a": 1}}
     with pytest.raises(RunError, match=r"6 of 6 units are not done: run again with --resume"):
         make(tmp_path / "empty.zarr").finish({})
+
+
+def test_maps_are_added_to_a_whole_store(full: ResultStore) -> None:
+    before = files(full.path)
+    values = np.random.default_rng(1).normal(size=(Y.size, X.size)).astype(np.float32)
+    for _ in range(2):  # the second time replaces the first
+        store = full.add_maps(("area_rate", "area_rate_std"), {"growth": {"window": 5}})
+        assert np.isnan(store.read("area_rate")).all()
+        store.write_map("area_rate", 1, values)
+    assert store.names == (*NAMES, "area_rate", "area_rate_std")
+    assert store.attrs["growth"] == {"window": 5}
+    np.testing.assert_array_equal(store.read("area_rate", 1), values)
+    assert np.isnan(store.read("area_rate", 0)).all()
+    assert {name: data for name, data in files(full.path).items() if name in before and name != "zarr.json"} == {
+        name: data for name, data in before.items() if name != "zarr.json"
+    }
+    with pytest.raises(ValueError, match="needs the shape"):
+        store.write_map("area_rate", 1, values[1:])
+
+
+def test_maps_are_not_added_to_an_unfinished_store(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="6 of 6 units are not done"):
+        make(tmp_path / "out.zarr").add_maps(("area_rate",), {})
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted"),
+    [
+        ("mm", ("mm", 1.0)),
+        ("%/frame", ("%/h", 30.0)),
+        ("mm/frame²", ("mm/h²", 900.0)),
+        ("1/(frame mm)", ("1/(h mm)", 30.0)),
+    ],
+)
+def test_rates_per_hour(unit: str, wanted: tuple[str, float]) -> None:
+    assert per_hour(unit, 120.0) == wanted
+    assert per_hour(unit, None) == (unit, 1.0)
 
 
 def test_unwritable_folder_is_a_run_error(tmp_path: Path) -> None:
