@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from leafflow_ti.capture import Capture, Geometry, capture_from_array, open_capture
     from leafflow_ti.config import RunConfig, load_config
     from leafflow_ti.engines import release
+    from leafflow_ti.exporters import export
     from leafflow_ti.field import Field
     from leafflow_ti.inspection import check
     from leafflow_ti.results import ResultStore
@@ -28,9 +29,11 @@ _HOME = {
     "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
     "check": "inspection", "Rig": "rig", "plan_rig": "rig",
     "release": "engines",
+    "export": "exporters",
 }  # fmt: skip
 __all__ = [
     "Capture", "Field", "Geometry", "ResultStore", "Rig", "RunConfig", "capture_from_array", "check", "estimate",
+    "export",
     "load_config", "open_capture", "plan_rig", "plan_run", "release", "run",
 ]  # fmt: skip
 
