@@ -31,8 +31,8 @@ def export(
 
     tiff: a folder of float32 stacks for ImageJ and Fiji, one per map. ome-tiff: one file, maps as channels. netcdf:
     one file by the CF conventions. ply, vtk: a folder with the surface of each frame as a mesh, all maps at its
-    vertices; open series.pvd in ParaView. csv: a line per measured pixel. Names that end in a suffix are one file, other
-    names a folder.
+    vertices; open series.pvd in ParaView. csv: a line per measured pixel. Names that end in a suffix are one file,
+    other names a folder.
     """
     from leafflow_ti.exporters import export as write
 
