@@ -27,7 +27,7 @@ SUFFIXES = (".csv", ".parquet")
 
 
 def column_name(name: str, unit: str) -> str:
-    """Name of a column with its unit: ``growth``, ``%/h`` give ``growth_percent_per_h``; the unit ``1`` adds nothing."""
+    """Name of a column with its unit: ``growth``, ``%/h`` give ``growth_percent_per_h``; ``1`` adds nothing."""
     above, _, below = unit.partition("/")
     words = [name]
     if above != "1":
