@@ -45,6 +45,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("matching", "positions", "photometry"), 3),
     **dict.fromkeys(("expected",), 6),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
+    **dict.fromkeys(("napari_reader",), 7),
     **dict.fromkeys(("rig", "rig_choices", "inspection", "inspection_advice", "inspection_report"), 7),
     **dict.fromkeys(("cli",), 8),
 }
