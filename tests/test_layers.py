@@ -33,7 +33,7 @@ LAYERS: dict[str, int] = {
         ),
         3,
     ),
-    **dict.fromkeys(("presets", "blocks", "uneven", "splines", "refine_plan", "noise", "aim", "rates"), 3),
+    **dict.fromkeys(("presets", "blocks", "uneven", "splines", "refine_plan", "noise", "aim", "rates", "mesh"), 3),
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
@@ -45,6 +45,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("matching", "positions", "photometry"), 3),
     **dict.fromkeys(("expected", "correlation"), 6),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
+    **dict.fromkeys(("napari_reader",), 7),
     **dict.fromkeys(("rig", "rig_choices", "inspection", "inspection_advice", "inspection_report"), 7),
     **dict.fromkeys(("cli",), 8),
 }
