@@ -219,10 +219,11 @@ def test_simulate_cube(tmp_path: Path) -> None:
 def test_simulate_leaf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "l"
     options = (
-        "--cameras 2 --frames 3 --size 60x50 --focal-px 700 --baseline-mm 4 --centre-mm .5,1 --depth-mm 90 --slope-x .1 "
-        "--slope-y -.3 --turn-deg 30 --curvature .02,-.03 --half-mm 3,2 --pointed --velocity .1,0,.2 --omega-deg 1,2,3 "
-        "--rotation-centre-mm 0,1,95 --acceleration .01,0,0 --growth .1,0 --brightness t,1,.01,.02,0 --offset 100 "
-        "--contrast 20 --background 9 --wavelength-mm 1,5 --texture-seed 4 --supersampling 2 --interval-s 60"
+        "--cameras 2 --frames 3 --size 60x50 --focal-px 700 --baseline-mm 4 --centre-mm .5,1 --depth-mm 90 "
+        "--slope-x .1 --slope-y -.3 --turn-deg 30 --curvature .02,-.03 --half-mm 3,2 --pointed --velocity .1,0,.2 "
+        "--omega-deg 1,2,3 --rotation-centre-mm 0,1,95 --acceleration .01,0,0 --growth .1,0 "
+        "--brightness t,1,.01,.02,0 --offset 100 --contrast 20 --background 9 --wavelength-mm 1,5 "
+        "--texture-seed 4 --supersampling 2 --interval-s 60"
     )
     assert command("simulate", "leaf", out, *options.split()) == 0
     assert "--preshift -31,0" in capsys.readouterr().out
