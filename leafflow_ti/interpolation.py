@@ -95,7 +95,8 @@ class Cells:
         """Bilinear means [..., n] of maps [..., y, x]; pixels without weight do not count."""
         total = np.zeros((*values.shape[:-2], self.col.size))
         for row, col, weight in self.corners:
-            total += np.where(weight > ON_PIXEL, weight * values[..., row, col], 0.0)
+            with np.errstate(invalid="ignore"):  # infinite, without weight
+                total += np.where(weight > ON_PIXEL, weight * values[..., row, col], 0.0)
         return total
 
 

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from leafflow_ti.drift import closure, noise
 from leafflow_ti.errors import InputError, UsageError
-from leafflow_ti.interpolation import Cells, Reading
+from leafflow_ti.interpolation import Reading
 from leafflow_ti.point_maps import PointMaps, Samples
 
 if TYPE_CHECKING:
