@@ -196,6 +196,7 @@ def _provenance(plan: Plan, capture: Capture, device: Device, contents: bool = T
             "preshift_px": "adaptive" if plan.adaptive else list(plan.preshift),
             "f_px": g.f_px, "principal_px": list(g.principal_px), "baseline_mm": list(g.baseline_mm),
             "disparity_offset_px": list(g.disparity_offset_px), "time_offset": plan.time_offset,
+            "image_px": [capture.width, capture.height],
         },
         "leafflow_ti_version": __version__,
         "versions": {"python": platform.python_version()} | {p: installed(p) for p in ("taichi", "numpy", "zarr")},

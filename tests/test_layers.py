@@ -33,7 +33,7 @@ LAYERS: dict[str, int] = {
         ),
         3,
     ),
-    **dict.fromkeys(("presets", "blocks", "uneven", "splines", "refine_plan", "noise", "aim", "rates"), 3),
+    **dict.fromkeys(("presets", "blocks", "uneven", "splines", "refine_plan", "noise", "aim", "rates", "mesh"), 3),
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
