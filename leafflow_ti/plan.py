@@ -22,7 +22,7 @@ from leafflow_ti.capture import (
 )
 from leafflow_ti.config import RunConfig, resolve
 from leafflow_ti.errors import ConfigError
-from leafflow_ti.field import FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, QUANTITIES, with_std
+from leafflow_ti.field import CORRELATIONS, FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, QUANTITIES, with_std
 from leafflow_ti.identify import Limits
 from leafflow_ti.model_plan import cameras_read, check_model, fitted_motion, model_problem, sampling_of, static
 from leafflow_ti.models import MODELS, TensorLayout
@@ -134,6 +134,8 @@ class Plan:
             names += ["slope_x", "slope_y"]
         names += self.ranges.quantities if self.ranges else ()
         names += MOTION_NAMES[: problem.unknowns]
+        if problem.unknowns > 1:
+            names += CORRELATIONS[:1] if problem.unknowns == 2 else CORRELATIONS
         if "t" in problem.columns.solutions and not self.ranges:
             names += ["flow_x", "flow_y", "normal_flow_x", "normal_flow_y"]
             if not problem.unknowns and len(problem.offsets) > 1:
