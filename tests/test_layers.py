@@ -44,6 +44,8 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
     **dict.fromkeys(("matching", "positions", "photometry"), 3),
     **dict.fromkeys(("expected", "correlation"), 6),
+    **dict.fromkeys(("colours", "display"), 2),
+    **dict.fromkeys(("panels", "report"), 7),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
     **dict.fromkeys(("tables",), 3),
     **dict.fromkeys(("exporters",), 7),
