@@ -38,13 +38,13 @@ _COMPRESSOR = ZstdCodec(level=0, checksum=False)
 _METADATA = "zarr.json"
 """The group's metadata file, attributes included (Zarr v3)."""
 
-_COORDINATES: dict[str, dict[str, Any]] = {
+COORDINATES: dict[str, dict[str, Any]] = {
     "t": {"long_name": "index of the reference frame", "units": "frame"},
     "y": {"long_name": "row in the reference image, downwards", "units": "px"},
     "x": {"long_name": "column in the reference image, to the right", "units": "px"},
 }
 
-_TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
+TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class ResultStore:
                 group = zarr.create_group(scratch, zarr_format=3)
                 group.update_attributes({"Conventions": "CF-1.11", **attrs, "leafflow_ti_format": FORMAT})
                 for axis, values in coordinates.items():
-                    attributes = dict(_COORDINATES[axis])
+                    attributes = dict(COORDINATES[axis])
                     if axis == "t" and interval_s is not None:
                         attributes["interval_s"] = float(interval_s)
                     if axis == "t" and time_offset:
@@ -107,7 +107,7 @@ class ResultStore:
                     group.create_array(axis, data=values, dimension_names=[axis], attributes=attributes)
                 if times_s is not None:
                     times = np.asarray(times_s, np.float64)
-                    group.create_array("time", data=times, dimension_names=["t"], attributes=_TIME)
+                    group.create_array("time", data=times, dimension_names=["t"], attributes=TIME)
                 for name in (*names, "status"):
                     _create_map(group, name, f"{name}_std" in names, shape, chunk)
                 (scratch / "status" / ".done").mkdir()
@@ -160,6 +160,19 @@ class ResultStore:
         """Time between frames [s], None when unknown."""
         value = self._arrays["t"].attrs.get("interval_s")
         return float(value) if isinstance(value, int | float) else None
+
+    @property
+    def times_s(self) -> NDArray[np.float64] | None:
+        """When the results of each frame are [s]: by the measured stamps, else by the interval from frame 0 on.
+
+        None where neither is known.
+        """
+        if "time" in self._arrays:
+            return np.asarray(self._arrays["time"][...], np.float64)
+        if self.interval_s is None:
+            return None
+        offset = float(self._arrays["t"].attrs.get("time_offset", 0.0))  # type: ignore[arg-type]
+        return (np.array(self.frames) + offset) * self.interval_s
 
     @property
     def bands(self) -> int:
@@ -292,7 +305,7 @@ def _create_map(group: zarr.Group, name: str, has_std: bool, shape: tuple[int, .
         chunks=chunk,
         dtype=empty_map(name, ()).dtype,
         fill_value=empty_map(name, ()).item(),
-        dimension_names=list(_COORDINATES),
+        dimension_names=list(COORDINATES),
         attributes=attributes,
         compressors=_COMPRESSOR,
         filters=None,

@@ -403,6 +403,9 @@ def measure(solved, problem, view, x, y, own=()):
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
         for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=False):
             found[name] = (value, error)
+        for i, j in [pair for pair in ((0, 1), (0, 2), (1, 2)) if max(pair) < problem.unknowns]:
+            correlation = cov_q[i, j] / np.sqrt(cov_q[i, i] * cov_q[j, j])
+            found[f"velocity_correlation_{'xyz'[i]}{'xyz'[j]}"] = (correlation, None)
     if problem.world_brightness:
         i = [columns.index("i", o) for o in problem.world_brightness]
         Z0, ZX, ZY, c = surface(x0, y0, f, *g)
