@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from leafflow_ti.inspection import check
     from leafflow_ti.results import ResultStore
     from leafflow_ti.rig import Rig, plan_rig
+    from leafflow_ti.surface_growth import measure_growth
 
 __version__ = "0.1.0"
 
@@ -27,11 +28,11 @@ _HOME = {
     "Capture": "capture", "Geometry": "capture", "capture_from_array": "capture", "open_capture": "capture",
     "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
     "check": "inspection", "Rig": "rig", "plan_rig": "rig",
-    "release": "engines",
+    "release": "engines", "measure_growth": "surface_growth",
 }  # fmt: skip
 __all__ = [
     "Capture", "Field", "Geometry", "ResultStore", "Rig", "RunConfig", "capture_from_array", "check", "estimate",
-    "load_config", "open_capture", "plan_rig", "plan_run", "release", "run",
+    "load_config", "measure_growth", "open_capture", "plan_rig", "plan_run", "release", "run",
 ]  # fmt: skip
 
 

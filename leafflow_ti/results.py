@@ -162,6 +162,19 @@ class ResultStore:
         return float(value) if isinstance(value, int | float) else None
 
     @property
+    def times_s(self) -> NDArray[np.float64] | None:
+        """When the results of each frame are [s]: by the measured stamps, else by the interval from frame 0 on.
+
+        None where neither is known.
+        """
+        if "time" in self._arrays:
+            return np.asarray(self._arrays["time"][...], np.float64)
+        if self.interval_s is None:
+            return None
+        offset = float(self._arrays["t"].attrs.get("time_offset", 0.0))  # type: ignore[arg-type]
+        return (np.array(self.frames) + offset) * self.interval_s
+
+    @property
     def bands(self) -> int:
         """Units per frame; unit ``t_index * bands + band`` holds the rows from ``band * unit_rows``."""
         return -(-self.y.size // self.unit_rows)

@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube)."),
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
+    "growth": ("growth:growth", "Measure growth and strain from the motion in a results store."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),
     "profile": ("profile:profile", "Measure the stages of a run on this machine, and predict the whole."),
     "check": ("check:check", "Say whether a capture can be measured, and what to change."),
