@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from leafflow_ti.engines import release
     from leafflow_ti.field import Field
     from leafflow_ti.inspection import check
+    from leafflow_ti.report import write_report
     from leafflow_ti.results import ResultStore
     from leafflow_ti.rig import Rig, plan_rig
 
@@ -27,11 +28,12 @@ _HOME = {
     "Capture": "capture", "Geometry": "capture", "capture_from_array": "capture", "open_capture": "capture",
     "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
     "check": "inspection", "Rig": "rig", "plan_rig": "rig",
-    "release": "engines",
+    "release": "engines", "write_report": "report",
 }  # fmt: skip
 __all__ = [
     "Capture", "Field", "Geometry", "ResultStore", "Rig", "RunConfig", "capture_from_array", "check", "estimate",
     "load_config", "open_capture", "plan_rig", "plan_run", "release", "run",
+    "write_report",
 ]  # fmt: skip
 
 
