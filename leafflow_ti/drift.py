@@ -14,6 +14,9 @@ slides from one surface to another. That distance is the *closure*, what is left
 steps and returning by the second; the track runs between the two. Half of it is added to the bound. Where no
 acceleration is measured, it is the change of the motion since the frame before.
 
+**Between output pixels** the motion is taken as bilinear; what its second differences say to that, along the way, is
+the third part of the bound.
+
 A stretch of the image along the way, which stretches an error with it, is not counted, nor is what all frames have in
 common: a calibration that is off, light that moves with the leaf.
 """
@@ -70,3 +73,10 @@ def closure(motion: Floats, acceleration: Floats, steps: Floats) -> Floats:
         ahead, back = (np.where(np.isnan(acceleration), found, acceleration) for found in (before, behind))
         apart[1:] = np.cumsum(0.5 * h**2 * (ahead[:-1] + back[1:]) - h * change, axis=0)
     return np.asarray(np.hypot(apart[:, 0], apart[:, 1]))
+
+
+def bent(bend: Floats, steps: Floats) -> Floats:
+    """Distance [S, n] px that adds up between output pixels, by the ``bend`` [S, 2, n] px/frame of ``Samples``."""
+    total = np.zeros(bend.shape)
+    total[1:] = np.cumsum(0.5 * steps[:, None, None] * (bend[1:] + bend[:-1]), axis=0)
+    return np.asarray(np.hypot(total[:, 0], total[:, 1]))

@@ -102,14 +102,17 @@ class Cells:
 
 class Surface:
     """Which points of a frame can be read: ``known`` [y, x] pixels with values, ``joined`` which of them lie on one
-    surface; None: all."""
+    surface; None: all.
+
+    ``parted``: whether a pixel lies on another surface than the one "beside" it [y, x - 1], or "below" [y - 1, x].
+    """
 
     def __init__(self, known: Mask, joined: Joined | None = None):
         self._known = known
         whole = slice(None)
         before, behind = slice(None, -1), slice(1, None)
         cuts = {"beside": ((whole, before), (whole, behind)), "below": ((before, whole), (behind, whole))}
-        self._parted = {
+        self.parted = {
             side: np.zeros(known[first].shape, np.bool_) if joined is None else ~joined(first, second)
             for side, (first, second) in cuts.items()
         }
@@ -123,8 +126,8 @@ class Surface:
         across, along = ((part < 1 - ON_PIXEL, part > ON_PIXEL) for part in (cells.right, cells.down))
         parted = np.zeros(cells.col.shape, np.bool_)
         for one in (0, 1):
-            parted |= across[0] & across[1] & along[one] & self._parted["beside"][cells.row + one, cells.col]
-            parted |= along[0] & along[1] & across[one] & self._parted["below"][cells.row, cells.col + one]
+            parted |= across[0] & across[1] & along[one] & self.parted["beside"][cells.row + one, cells.col]
+            parted |= along[0] & along[1] & across[one] & self.parted["below"][cells.row, cells.col + one]
         return np.select(
             [~cells.inside, missing, parted], [Reading.OUTSIDE, Reading.UNMEASURED, Reading.EDGE], Reading.OK
         ).astype(np.uint8)
@@ -133,3 +136,20 @@ class Surface:
 def finite(maps: Sequence[NDArray[Any]]) -> Mask:
     """Pixels [y, x] at which all maps are finite."""
     return np.asarray(np.all([np.isfinite(values) for values in maps], axis=0))
+
+
+def second_differences(values: Floats, surface: Surface) -> tuple[Floats, Floats]:
+    """``v[i - 1] - 2 v[i] + v[i + 1]`` of maps [..., y, x] along x and along y.
+
+    0 at the ends, and where one of the three has no value or lies on another surface.
+    """
+    found = []
+    for axis, side in ((-1, "beside"), (-2, "below")):
+        moved = np.moveaxis(values, axis, -1)
+        parted = np.moveaxis(surface.parted[side], axis, -1)
+        bend = np.zeros(moved.shape)
+        with np.errstate(invalid="ignore"):
+            inner = moved[..., :-2] - 2 * moved[..., 1:-1] + moved[..., 2:]
+        bend[..., 1:-1] = np.where(np.isfinite(inner) & ~(parted[..., :-1] | parted[..., 1:]), inner, 0.0)
+        found.append(np.moveaxis(bend, -1, axis))
+    return found[0], found[1]

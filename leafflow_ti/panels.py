@@ -99,8 +99,7 @@ class Panel:
                 return f"{self.key} in the image plane"
             case "normals":
                 return "surface normals"
-        is_error = self.key.endswith("_std")
-        return self.key.removesuffix("_std").replace("_", " ") + ", standard error" * is_error
+        return quantity_title(self.key)
 
     @property
     def long_name(self) -> str:
@@ -118,17 +117,13 @@ class Panel:
     @property
     def unit(self) -> str:
         """Unit of the values shown: growth and strain per hour where the time between frames is known."""
-        return self._per_hour()[0] if self.needs else ""
-
-    def _per_hour(self) -> tuple[str, float]:
-        unit = quantity(self.needs[0])[0]
-        return per_hour(unit, self.interval_s) if unit.startswith("%") else (unit, 1.0)
+        return shown_in(self.needs[0], self.interval_s)[0] if self.needs else ""
 
     def values(self, field: Field) -> NDArray[np.floating]:
         """Values [y, x] in ``unit`` that the colours show; ValueError for normals and statuses, which have no scale."""
         match self.kind:
             case "map":
-                return np.asarray(field[self.key] * self._per_hour()[1])
+                return np.asarray(field[self.key] * shown_in(self.key, self.interval_s)[1])
             case "arrows":
                 return np.asarray(np.hypot(*(field[name] for name in self.needs)))
         raise ValueError(f"{self.key} has no scale of colours")
@@ -183,6 +178,17 @@ def extent(positions: NDArray[np.int64]) -> tuple[float, float]:
     """Outer edges [px] of the first and last pixel of an axis, or block of a stride."""
     step = float(positions[1] - positions[0]) if positions.size > 1 else 1.0
     return (float(positions[0]) - step / 2, float(positions[-1]) + step / 2)
+
+
+def quantity_title(name: str) -> str:
+    """Name of a map in words: ``depth, standard error``."""
+    return name.removesuffix("_std").replace("_", " ") + ", standard error" * name.endswith("_std")
+
+
+def shown_in(name: str, interval_s: float | None) -> tuple[str, float]:
+    """Unit that people read the map ``name`` in, and the factor to it: growth and strain per hour where possible."""
+    unit = quantity(name)[0]
+    return per_hour(unit, interval_s) if unit.startswith("%") else (unit, 1.0)
 
 
 def panels_of(names: Collection[str], interval_s: float | None = None) -> dict[str, list[Panel]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from leafflow_ti.correlation import NoiseCorrelation
 from leafflow_ti.errors import InputError
 from leafflow_ti.field import CORRELATIONS, with_std
-from leafflow_ti.interpolation import Cells, Joined, Lattice, Surface, finite
+from leafflow_ti.interpolation import Cells, Joined, Lattice, Surface, finite, second_differences
 from leafflow_ti.mesh import JUMP, Neighbours
 from leafflow_ti.status import Status
 
@@ -30,16 +30,18 @@ SLOPES = ("slope_x", "slope_y")
 @dataclass(frozen=True, eq=False)
 class Samples:
     """What n points find in a frame: ``motion`` [2, n] px/frame with its standard error ``std``, ``acceleration``
-    [2, n] px/frame² (NaN where it is not measured), ``depth`` [n] mm (NaN without depth)."""
+    [2, n] px/frame² (NaN where it is not measured), ``depth`` [n] mm (NaN without depth). ``bend`` [2, n] px/frame: by
+    how much the motion's second differences say that its bilinear mean is off."""
 
     motion: Floats
     std: Floats
     acceleration: Floats
     depth: Floats
+    bend: Floats
 
     def where(self, alive: NDArray[np.bool_]) -> Samples:
         """The same, NaN for points that are not ``alive`` [n]."""
-        return Samples(*(np.where(alive, v, np.nan) for v in (self.motion, self.std, self.acceleration, self.depth)))
+        return Samples(*(np.where(alive, getattr(self, one.name), np.nan) for one in fields(self)))
 
 
 class FrameAtPoints:
@@ -47,6 +49,7 @@ class FrameAtPoints:
 
     def __init__(self, lattice: Lattice, surface: Surface, stack: Floats):
         self._lattice, self._surface, self._stack = lattice, surface, stack
+        self._bends = second_differences(stack[:2], surface)
 
     def reading(self, at: Floats) -> NDArray[np.uint8]:
         """Codes of ``interpolation.Reading`` [n] at the positions ``at`` [2, n] px."""
@@ -58,9 +61,14 @@ class FrameAtPoints:
 
     def samples(self, at: Floats) -> Samples:
         """All that is read at the positions ``at`` [2, n] px."""
-        found = Cells.at(self._lattice, *at).mean(self._stack)
+        cells = Cells.at(self._lattice, *at)
+        found = cells.mean(self._stack)
+        bend = sum(
+            0.5 * part * (1 - part) * cells.mean(values)
+            for part, values in zip((cells.right, cells.down), self._bends, strict=True)
+        )
         with np.errstate(divide="ignore"):
-            return Samples(found[:2], found[2:4], found[4:6], 1 / found[6])
+            return Samples(found[:2], found[2:4], found[4:6], 1 / found[6], np.asarray(bend))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ frame has it: only its way in the image is integrated. From frame to frame (h ap
 
     x(t + h) = x(t) + ∫ u,   u the parabola through the motions at t - h', t and t + h        (Adams-Moulton)
 
-of third order; the first step, that of the trapezoid, of second. It is implicit, solved by fixed-point steps. Each
-step needs the maps of one more frame, and the motion that the point had in the two before.
+of third order. It is implicit, solved by fixed-point steps. Each step needs the maps of one more frame, and the motion
+that the point had in the two before. The first one is that of the trapezoid, corrected when the third motion is known.
 
 Frames of results that lie half way between two images (``time_offset``) are as far from each other: tracks lie there,
 too. Positions are those of the reference camera: X right, Y down, Z away from it.
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from leafflow_ti.drift import closure, noise
+from leafflow_ti.drift import bent, closure, noise
 from leafflow_ti.errors import InputError, UsageError
 from leafflow_ti.interpolation import Reading
 from leafflow_ti.point_maps import PointMaps, Samples
@@ -174,12 +174,12 @@ class _Way:
         """From the points ``first`` [2, n] of the first of the frames with the indices ``order``."""
         order = list(order)
         samples, at, status = _followed(maps, first, order, clock)
-        motion, std, acceleration = (
-            np.array([getattr(s, name) for s in samples]) for name in ("motion", "std", "acceleration")
+        motion, std, acceleration, bend = (
+            np.array([getattr(s, name) for s in samples]) for name in ("motion", "std", "acceleration", "bend")
         )
         steps = np.diff(clock[order])
         apart = closure(motion, acceleration, steps)
-        drift = noise(std, maps.correlation, steps) + 0.5 * apart
+        drift = noise(std, maps.correlation, steps) + 0.5 * apart + bent(bend, steps)
         with np.errstate(invalid="ignore"):
             lost = np.logical_or.accumulate(drift > max_drift, axis=0)
         status[lost.any(axis=0)] = TrackStatus.DRIFTED
@@ -215,6 +215,10 @@ def _followed(
         alive = status == Reading.OK
         at[k] = np.where(alive, place, np.nan)
         samples.append(frame.samples(place).where(alive))
+        if k == 2:
+            back = _weights(clock[order[0]] - clock[order[1]], clock[order[1]] - clock[order[2]])
+            way = sum(w * samples[i].motion for w, i in zip(back, (2, 1, 0), strict=True))
+            at[1:3] += np.where(alive, first - way - at[1], 0.0)
     return samples, at, status
 
 

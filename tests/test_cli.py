@@ -336,7 +336,6 @@ def test_run_without_capture_exits_with_4_or_3(
 def test_choices_in_the_help_are_those_of_the_configuration(name: str) -> None:
     choices = getattr(config_sections, name, None) or getattr(config, name)
     assert get_args(getattr(options, name))[1].metavar == "|".join(get_args(choices))
-    assert get_args(options.Model)[1].metavar == "|".join(get_args(config_sections.ModelName))
 
 
 # --- progress --------------------------------------------------------------------------------------------------------

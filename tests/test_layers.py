@@ -46,6 +46,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("expected", "correlation"), 6),
     **dict.fromkeys(("colours", "display"), 2),
     **dict.fromkeys(("panels", "report"), 7),
+    **dict.fromkeys(("surface_growth",), 7),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
     **dict.fromkeys(("tables",), 3),
     **dict.fromkeys(("exporters",), 7),

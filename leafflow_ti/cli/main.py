@@ -23,11 +23,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube)."),
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
+    "growth": ("growth:growth", "Measure growth and strain from the motion in a results store."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),
     "export": ("export:export", "Write results for Fiji, ParaView, MATLAB, R and other programs."),
     "profile": ("profile:profile", "Measure the stages of a run on this machine, and predict the whole."),
     "check": ("check:check", "Say whether a capture can be measured, and what to change."),
     "plan-rig": ("plan_rig:plan_rig", "Predict the standard errors of a camera rig, and what would improve it most."),
+    "report": ("report:report", "Write one HTML page of results: maps, curves, quality, the surface in 3D."),
     "info": ("info:info", "Say what a capture, or a results store, is."),
 }
 """Command -> where it lives (module of this package:object) and its line in the help."""
