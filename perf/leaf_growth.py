@@ -128,11 +128,8 @@ class Measured:
     def together(cls, several: Sequence[Measured]) -> Measured:
         """All of them, one below the other."""
         maps, true = (
-            {
-                name: np.concatenate([getattr(one, which)[name] for one in several])
-                for name in getattr(several[0], which)
-            }
-            for which in ("maps", "truth")
+            {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            for parts in ([one.maps for one in several], [one.truth for one in several])
         )
         return cls(maps, true, np.concatenate([one.inside for one in several]))
 
@@ -166,16 +163,13 @@ def figures(found: metrics.RegionReport, variant: Variant, noise: float) -> Iter
     """Of both measures: error of the area's growth, of the principal direction, and coverage where there is noise."""
     label = f"{variant.label}, noise {noise:g}"
     for measure, (area, direction, strains, goal) in MEASURES.items():
-        error = found.errors[f"{area}_percent"]
+        error, where = found.errors[f"{area}_percent"], f"{label}, {measure}"
         note = f"95 % within {error.p95_abs:.2g}, {error.n} px"
-        yield Figure(f"{label}, {measure}: area, |mean error|", abs(error.mean), "%/frame", goal)
-        yield Figure(
-            f"{label}, {measure}: area, rms", float(np.hypot(error.mean, error.std)), "%/frame", goal, note=note
-        )
+        yield Figure(f"{where}: area, |mean error|", abs(error.mean), "%/frame", goal)
+        yield Figure(f"{where}: area, rms error", rms(error), "%/frame", goal, note=note)
         if f"{direction}_deg" in found.errors:
             turn = found.errors[f"{direction}_deg"]
-            rms = float(np.hypot(turn.mean, turn.std))
-            yield Figure(f"{label}, {measure}: principal direction, rms", rms, "deg", DIRECTION, note=f"{turn.n} px")
+            yield Figure(f"{where}: principal direction, rms error", rms(turn), "deg", DIRECTION, note=f"{turn.n} px")
         for name in (area, *strains):
             if noise > 0.0 and name in found.coverage:
                 bars = found.coverage[name]
