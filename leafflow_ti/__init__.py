@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from leafflow_ti.inspection import check
     from leafflow_ti.results import ResultStore
     from leafflow_ti.rig import Rig, plan_rig
-    from leafflow_ti.tracking import Tracks, track
+    from leafflow_ti.track_growth import track_growth
+    from leafflow_ti.tracking import track
+    from leafflow_ti.tracks import Tracks
 
 __version__ = "0.1.0"
 
@@ -28,7 +30,8 @@ _HOME = {
     "Capture": "capture", "Geometry": "capture", "capture_from_array": "capture", "open_capture": "capture",
     "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
     "check": "inspection", "Rig": "rig", "plan_rig": "rig",
-    "release": "engines", "Tracks": "tracking", "track": "tracking",
+    "release": "engines", "Tracks": "tracks", "leaf_axes": "leaf_axes",
+    "track": "tracking", "track_growth": "track_growth",
 }  # fmt: skip
 __all__ = [
     "Capture", "Field", "Geometry", "ResultStore", "Rig", "RunConfig", "Tracks", "capture_from_array", "check",

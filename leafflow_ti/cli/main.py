@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube)."),
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),
+    "track": ("track:track", "Follow points through the frames; growth and strain since the start."),
     "profile": ("profile:profile", "Measure the stages of a run on this machine, and predict the whole."),
     "check": ("check:check", "Say whether a capture can be measured, and what to change."),
     "plan-rig": ("plan_rig:plan_rig", "Predict the standard errors of a camera rig, and what would improve it most."),
