@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from leafflow_ti.regions import RegionTable, measure_regions
     from leafflow_ti.results import ResultStore
     from leafflow_ti.rig import Rig, plan_rig
+    from leafflow_ti.surface_growth import measure_growth
     from leafflow_ti.tracking import Tracks, track
 
 __version__ = "0.1.0"
@@ -32,11 +33,12 @@ _HOME = {
     "check": "inspection", "Rig": "rig", "plan_rig": "rig",
     "release": "engines", "Tracks": "tracking", "track": "tracking",
     "export": "exporters", "RegionTable": "regions", "measure_regions": "regions",
+    "measure_growth": "surface_growth",
 }  # fmt: skip
 __all__ = [
     "Capture", "Field", "Geometry", "RegionTable", "ResultStore", "Rig", "RunConfig", "Tracks",
-    "capture_from_array", "check", "estimate", "export", "load_config", "measure_regions", "open_capture", "plan_rig",
-    "plan_run", "release", "run", "track",
+    "capture_from_array", "check", "estimate", "export", "load_config", "measure_growth", "measure_regions",
+    "open_capture", "plan_rig", "plan_run", "release", "run", "track",
 ]  # fmt: skip
 
 

@@ -21,10 +21,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from leafflow_ti.errors import InputError
-from leafflow_ti.field import CORRELATIONS, MOTION_NAMES
+from leafflow_ti.field import CORRELATIONS, MOTION_NAMES, Field
 from leafflow_ti.plan import Plan
 from leafflow_ti.refine_plan import Refinement
 from leafflow_ti.results import ResultStore
@@ -57,8 +57,8 @@ class NoiseCorrelation:
     stated: bool = True
 
     @classmethod
-    def of(cls, store: ResultStore) -> NoiseCorrelation:
-        """Of a results store."""
+    def of(cls, store: ResultStore | Field) -> NoiseCorrelation:
+        """Of the results of a run, or of one frame of them."""
         plan: Mapping[str, Any] = store.attrs.get("plan", {})
         if KEY not in plan:
             side = int(tomllib.loads(store.attrs["config"])["window"]["size"])
@@ -69,12 +69,14 @@ class NoiseCorrelation:
             _at_pitch(found["x"], _pitch(store.x)), _at_pitch(found["y"], _pitch(store.y)), found.get("t", np.ones(1))
         )
 
-    def between(self, axis: str, n: int) -> Array:
-        """Correlation matrix [n, n] of so many consecutive output columns "x", rows "y" or frames "t"."""
-        first = np.zeros(n)
-        stated = getattr(self, axis)[:n]
+    def between(self, axis: str, places: ArrayLike) -> Array:
+        """Correlation matrix [n, n] of errors at these output columns "x", rows "y" or frames "t"; a number n: at as
+        many that follow each other."""
+        at = np.arange(places) if isinstance(places, int) else np.asarray(places, int)
+        distance = np.abs(np.subtract.outer(at, at))
+        stated = getattr(self, axis)
+        first = np.zeros(max(int(distance.max(initial=0)) + 1, stated.size))
         first[: stated.size] = stated
-        distance = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
         return np.asarray(first[distance])
 
 

@@ -44,6 +44,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
     **dict.fromkeys(("matching", "positions", "photometry"), 3),
     **dict.fromkeys(("expected", "correlation"), 6),
+    **dict.fromkeys(("surface_growth",), 7),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
     **dict.fromkeys(("tables",), 3),
     **dict.fromkeys(("exporters", "labels", "following", "region_noise", "regions", "diel"), 7),

@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube)."),
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
+    "growth": ("growth:growth", "Measure growth and strain from the motion in a results store."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),
     "export": ("export:export", "Write results for Fiji, ParaView, MATLAB, R and other programs."),
     "regions": ("regions:regions", "Measure each leaf of a label image: area, motion, growth per hour, diel curve."),

@@ -403,9 +403,6 @@ def measure(solved, problem, view, x, y, own=()):
         names = [f"{quantity}_{a}" for quantity in ("velocity", "rotation", "acceleration") for a in "xyz"]
         for name, value, error in zip(names[: problem.unknowns], q, np.sqrt(np.diag(cov_q)), strict=False):
             found[name] = (value, error)
-        for i, j in [pair for pair in ((0, 1), (0, 2), (1, 2)) if max(pair) < problem.unknowns]:
-            correlation = cov_q[i, j] / np.sqrt(cov_q[i, i] * cov_q[j, j])
-            found[f"velocity_correlation_{'xyz'[i]}{'xyz'[j]}"] = (correlation, None)
     if problem.world_brightness:
         i = [columns.index("i", o) for o in problem.world_brightness]
         Z0, ZX, ZY, c = surface(x0, y0, f, *g)
@@ -433,13 +430,25 @@ def flow_gradient(p, cov, columns: ColumnSet):
     return {name: (w @ p, np.sqrt(w @ cov @ w)) for name, w in weights.items()}
 
 
-def velocity_differences(solved, problem, view, x, y, own=()):
-    """Covariances of the velocity's central differences: name -> (value, geometric mean of its variances)."""
+def motion_spreads(solved, problem, view, x, y, own=()):
+    """Covariances of the motion, and of its central differences along x and y."""
     columns, sampling = problem.columns, problem.sampling
     P, cov = solved.P, solved.covariances(columns, sampling, DENOISE[problem.estimator])
     geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
     x0, y0 = x - view.principal_px[0], y - view.principal_px[1]
-    _, (_, *spreads), _ = fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own)
+    return fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own)[1]
+
+
+def velocity_correlations(solved, problem, view, x, y, own=()):
+    """Correlations of the errors of the velocity's components."""
+    C = motion_spreads(solved, problem, view, x, y, own)[0]
+    pairs = [pair for pair in ((0, 1), (0, 2), (1, 2)) if max(pair) < problem.unknowns]
+    return {f"velocity_correlation_{'xyz'[i]}{'xyz'[j]}": C[i, j] / np.sqrt(C[i, i] * C[j, j]) for i, j in pairs}
+
+
+def velocity_differences(solved, problem, view, x, y, own=()):
+    """Covariances of the velocity's central differences: name -> (value, geometric mean of its variances)."""
+    _, *spreads = motion_spreads(solved, problem, view, x, y, own)
     found = {}
     for axis, C in zip(("x", "y"), spreads, strict=True):
         for a, b in ("xx", "xy", "yy", "xz", "yz", "zz"):
