@@ -32,7 +32,7 @@ LEAST_POINTS = 3
 AXIS_STRAINS = ("strain_along", "strain_across", "strain_shear")
 
 
-def leaf_axes(store: ResultStore, tracks: Tracks, axis: ArrayLike | str = AUTO) -> Tracks:
+def leaf_coordinates(store: ResultStore, tracks: Tracks, axis: ArrayLike | str = AUTO) -> Tracks:
     """The tracks with ``along`` and ``across`` [n] mm at the start and, if they have a strain, ``AXIS_STRAINS`` [T, n].
 
     ``axis``: positions (x, y) px of two or more points on it [k, 2] in the frame of the start, or "auto": the longest

@@ -101,9 +101,12 @@ def _slopes(field: Field) -> tuple[Floats, Floats] | None:
 
 
 class Neighbours:
-    """Which pixels lie on one surface with a neighbour, and how far the depths of the two differ."""
+    """Which pixels lie on one surface with a neighbour.
 
-    def __init__(self, points: Floats, slopes: tuple[Floats, Floats] | None, jump: float):
+    ``points`` [y, x, 3]: positions, NaN where there is none; ``slopes``: dZ/dX, dZ/dY [y, x]; ``jump``: see ``JUMP``.
+    """
+
+    def __init__(self, points: Floats, slopes: tuple[Floats, Floats] | None, jump: float = JUMP):
         self.depth = points[..., 2]
         self._jump = jump
         with np.errstate(invalid="ignore"):

@@ -123,7 +123,9 @@ class Tracks:
 
     def chosen(self, points: NDArray[np.bool_]) -> Tracks:
         """Some of the points [n]."""
-        variables = {name: v[:, points] if v.shape[:2] == self.x.shape else v[points] for name, v in self.variables.items()}
+        variables = {
+            name: v[:, points] if v.shape[:2] == self.x.shape else v[points] for name, v in self.variables.items()
+        }
         cut = {name: getattr(self, name)[:, points] for name in ("x", "y", "position", "drift", "closure")}
         cut |= {name: getattr(self, name)[points] for name in ("status", "status_before")}
         return replace(self, variables=variables, **cut)
@@ -159,7 +161,7 @@ class Tracks:
             import xarray
         except ImportError:
             raise MissingExtra("xarray", "xarray", "Tracks.to_xarray") from None
-        flags = {
+        flags: dict[str, Any] = {
             "flag_values": np.array([int(code) for code in TrackStatus], np.uint8),
             "flag_meanings": " ".join(code.name.lower() for code in TrackStatus),
             "comment": "; ".join(f"{code.name.lower()}: {text}" for code, text in REASONS.items()),
@@ -170,7 +172,9 @@ class Tracks:
         }
         if self.times_s is not None:
             coordinates["time"] = ("t", self.times_s, {"long_name": "time of the frame", "units": "s"})
-        variables = {name: (("t", "point")[-v.ndim :], v, _attributes(name)) for name, v in self._named()}
+        variables: dict[str, Any] = {
+            name: (("t", "point")[-v.ndim :], v, _attributes(name)) for name, v in self._named()
+        }
         for name, values, when in (
             ("status", self.status, "why the track ends before the last frame"),
             ("status_before", self.status_before, "why the track begins after the first frame"),
@@ -219,7 +223,9 @@ class Tracks:
                 data.to_netcdf(scratch, engine="h5netcdf", encoding=packed)
             scratch.replace(path)
         except OSError as error:
-            raise RunError(f"{path}: cannot be written ({error.strerror or error}): mend that, or another name") from error
+            raise RunError(
+                f"{path}: cannot be written ({error.strerror or error}): mend that, or another name"
+            ) from error
         finally:
             if scratch.is_dir():
                 shutil.rmtree(scratch, ignore_errors=True)
@@ -245,7 +251,7 @@ def check_path(path: str | Path, overwrite: bool = False) -> Path:
         raise UsageError(f"{path} exists and holds no tracks, so --overwrite leaves it alone: give another name")
     if suffix == ".nc":
         try:
-            import h5netcdf  # type: ignore[import-untyped]  # noqa: F401
+            import h5netcdf  # noqa: F401
         except ImportError:
             raise MissingExtra("h5netcdf", "netcdf", "writing NetCDF") from None
     return path

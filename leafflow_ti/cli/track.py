@@ -69,9 +69,9 @@ def track(
     Each point has its place in the image and in space, a bound on its drift, and why it was lost. Growth is told by
     the rates along its way, with standard errors, and by the places of its neighbours, then and now.
     """
-    from leafflow_ti.leaf_axes import leaf_axes
+    from leafflow_ti.cumulative import track_growth
+    from leafflow_ti.leaf_axes import leaf_coordinates
     from leafflow_ti.results import ResultStore
-    from leafflow_ti.track_growth import track_growth
     from leafflow_ti.tracking import MAX_DRIFT
     from leafflow_ti.tracking import track as follow
     from leafflow_ti.tracks import check_path
@@ -88,7 +88,7 @@ def track(
         tracks = _labelled(tracks, store, labels)
     tracks = track_growth(store, tracks, gauge)
     if way is not None:
-        tracks = leaf_axes(store, tracks, way)
+        tracks = leaf_coordinates(store, tracks, way)
     tracks.save(out, overwrite)
     typer.echo("\n".join([*format_tracks(tracks, store.interval_s), f"tracks: {out}"]))
 
@@ -141,9 +141,9 @@ def _read_points(path: Path) -> Points:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (KeyError, TypeError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: no table of points: a first line with x,y, then one position in px a line") from error
+        raise InputError(f"{path}: no table of points: give a first line x,y and one position in px a line") from error
     if not found.size or not np.isfinite(found).all():
-        raise InputError(f"{path}: holds {len(found)} points, finite or not: at least one is needed, and all finite")
+        raise InputError(f"{path}: {len(found)} points, not all finite: give at least one, and finite ones only")
     return found[:, 0], found[:, 1]
 
 
