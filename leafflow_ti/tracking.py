@@ -14,10 +14,10 @@ too. Positions are those of the reference camera: X right, Y down, Z away from i
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,8 +66,10 @@ class Tracks:
     ``frames`` [T]: indices of the frames; ``times_s`` [T]: when they are, None if unknown; ``start``: the frame in
     which the points were given. ``x``, ``y`` [T, n] px: where a point is in the image, NaN from where it is lost;
     ``position`` [T, n, 3] mm: where in space, NaN without depth. ``drift`` [T, n] px: bound on how far from the truth
-    ``x``, ``y`` are, see ``drift.py``. ``status`` [n]: why a track ends before the last frame; ``status_before`` [n]:
+    ``x``, ``y`` are, ``closure`` [T, n] px: see ``drift.py``. ``status`` [n]: why a track ends before the last frame; ``status_before`` [n]:
     why it begins after the first one; codes of ``TrackStatus``.
+
+    ``variables``: what else is known of the points, [T, n] or [n], by the names of ``track_files.VARIABLES``.
 
     A point that was given where nothing is measured has its ``x``, ``y`` at the start and nothing else.
     """
@@ -82,6 +84,7 @@ class Tracks:
     closure: Floats
     status: NDArray[np.uint8]
     status_before: NDArray[np.uint8]
+    variables: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
     def n_points(self) -> int:
@@ -97,6 +100,16 @@ class Tracks:
     def known(self) -> NDArray[np.bool_]:
         """[T, n]: whether a point is known in a frame."""
         return np.isfinite(self.drift)
+
+    @property
+    def ways(self) -> tuple[list[int], list[int]]:
+        """Indices of the frames from the start ahead, and from the start back."""
+        at = self.start_index
+        return list(range(at, len(self.frames))), list(range(at, -1, -1))
+
+    def having(self, variables: Mapping[str, NDArray[Any]]) -> Tracks:
+        """The same with further ``variables``."""
+        return replace(self, variables={**self.variables, **variables})
 
     def __repr__(self) -> str:
         whole = int(self.known.all(axis=0).sum())
@@ -134,10 +147,10 @@ def track(
         raise UsageError(f"start = {start}: the store holds the frames {frames[0]}..{frames[-1]}: choose one of them")
     maps = PointMaps.of(store)
     at = store.frames.index(start)
-    clock = _clock(store)
+    times = clock(store)
     first = np.array([x, y])
-    ahead = _Way.along(maps, first, range(at, len(frames)), clock, max_drift)
-    back = _Way.along(maps, first, range(at, -1, -1), clock, max_drift)
+    ahead = _Way.along(maps, first, range(at, len(frames)), times, max_drift)
+    back = _Way.along(maps, first, range(at, -1, -1), times, max_drift)
     joined = [np.concatenate([b[:0:-1], a]) for a, b in zip(ahead.arrays, back.arrays, strict=True)]
     at_px, depth, drift, ends_apart = joined
     position = np.stack([*((at_px - maps.principal[:, None]) / maps.f_px).swapaxes(0, 1), np.ones_like(depth)], axis=-1)
@@ -147,7 +160,7 @@ def track(
     )  # fmt: skip
 
 
-def _clock(store: ResultStore) -> Floats:
+def clock(store: ResultStore) -> Floats:
     """When the results of each frame are, [T] in intervals between frames, the unit of the motion's time."""
     times, interval = store.times_s, store.interval_s
     return np.array(store.frames, float) if times is None or interval is None else times / interval
