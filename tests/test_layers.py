@@ -49,7 +49,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("surface_growth",), 7),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
     **dict.fromkeys(("tables",), 3),
-    **dict.fromkeys(("exporters",), 7),
+    **dict.fromkeys(("exporters", "labels", "following", "region_noise", "regions", "diel"), 7),
     **dict.fromkeys(("napari_reader",), 7),
     **dict.fromkeys(("rig", "rig_choices", "inspection", "inspection_advice", "inspection_report"), 7),
     **dict.fromkeys(("drift", "interpolation"), 3),

@@ -26,6 +26,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "growth": ("growth:growth", "Measure growth and strain from the motion in a results store."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),
     "export": ("export:export", "Write results for Fiji, ParaView, MATLAB, R and other programs."),
+    "regions": ("regions:regions", "Measure each leaf of a label image: area, motion, growth per hour, diel curve."),
     "profile": ("profile:profile", "Measure the stages of a run on this machine, and predict the whole."),
     "check": ("check:check", "Say whether a capture can be measured, and what to change."),
     "plan-rig": ("plan_rig:plan_rig", "Predict the standard errors of a camera rig, and what would improve it most."),
