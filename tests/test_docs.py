@@ -21,7 +21,7 @@ from leafflow_ti.config import RunConfig
 
 pytestmark = pytest.mark.xdist_group("docs")
 
-CONTINUES = {"growth.md": "getting-started.md", "opening.md": "growth.md", "formats.md": "getting-started.md"}
+CONTINUES = {"opening.md": "growth.md", "formats.md": "getting-started.md"}
 """Pages that go on with the files of another one."""
 
 
@@ -67,7 +67,7 @@ def table_defaults(text: str, title: str) -> list[tuple[str, str]]:
     for line in part.splitlines():
         if heading := re.match(r"### (?:`\[(\w+)\]`)?", line):
             section = f"{heading[1]}." if heading[1] else ""
-        elif row := re.match(r"\| `(\w+)` \| ([^|]*) \|", line):
+        elif row := re.match(r"\| `(\w+)` \|([^|]*)\|", line):
             found.append((section + row[1], row[2].strip()))
     return found
 
