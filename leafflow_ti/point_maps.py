@@ -116,6 +116,11 @@ class PointMaps:
             stack = np.concatenate([image, 1 / depth[None]])
         return FrameAtPoints(self.lattice, Surface(known, self._joined(maps)), stack)
 
+    def in_space(self, at: Floats, depth: Floats) -> Floats:
+        """Positions [..., n, 3] mm of the image positions ``at`` [..., 2, n] px at the depths [..., n] mm."""
+        rays = (at - self.principal[:, None]) / self.f_px
+        return np.stack([rays[..., 0, :] * depth, rays[..., 1, :] * depth, depth], axis=-1)
+
     def _rays(self) -> Floats:
         """Viewing rays (x/f, y/f) of the pixels, [2, h, w]."""
         x, y = ((at - c) / self.f_px for at, c in zip((self.store.x, self.store.y), self.principal, strict=True))

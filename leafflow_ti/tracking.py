@@ -14,10 +14,9 @@ too. Positions are those of the reference camera: X right, Y down, Z away from i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +25,8 @@ from leafflow_ti.drift import bent, closure, noise
 from leafflow_ti.errors import InputError, UsageError
 from leafflow_ti.interpolation import Reading
 from leafflow_ti.point_maps import PointMaps, Samples
+from leafflow_ti.tracks import Tracks as Tracks
+from leafflow_ti.tracks import TrackStatus as TrackStatus
 
 if TYPE_CHECKING:
     from leafflow_ti.results import ResultStore
@@ -37,86 +38,6 @@ MAX_DRIFT = 1.0
 ROUNDS = 3
 """Fixed-point steps of a time step. Each one gains the factor of the flow's gradient, which is below .1 in any sequence
 that can be measured; the prediction is off by a fraction of the change of motion between two frames."""
-
-
-class TrackStatus(IntEnum):
-    """Why a track ends; the first four codes are those of ``interpolation.Reading``."""
-
-    TRACKED = Reading.OK
-    OUTSIDE = Reading.OUTSIDE
-    UNMEASURED = Reading.UNMEASURED
-    EDGE = Reading.EDGE
-    DRIFTED = 4
-
-
-REASONS: dict[TrackStatus, str] = {
-    TrackStatus.TRACKED: "followed to the end",
-    TrackStatus.OUTSIDE: "left the measured part of the image",
-    TrackStatus.UNMEASURED: "came to where nothing is measured",
-    TrackStatus.EDGE: "came to the edge between two surfaces",
-    TrackStatus.DRIFTED: "its drift exceeded the limit",
-}
-"""One phrase for each status."""
-
-
-@dataclass(frozen=True, eq=False)
-class Tracks:
-    """Points followed through the frames of a store, T frames and n points.
-
-    ``frames`` [T]: indices of the frames; ``times_s`` [T]: when they are, None if unknown; ``start``: the frame in
-    which the points were given. ``x``, ``y`` [T, n] px: where a point is in the image, NaN from where it is lost;
-    ``position`` [T, n, 3] mm: where in space, NaN without depth. ``drift`` [T, n] px: bound on how far from the truth
-    ``x``, ``y`` are, ``closure`` [T, n] px: see ``drift.py``. ``status`` [n]: why a track ends before the last frame; ``status_before`` [n]:
-    why it begins after the first one; codes of ``TrackStatus``.
-
-    ``variables``: what else is known of the points, [T, n] or [n], by the names of ``track_files.VARIABLES``.
-
-    A point that was given where nothing is measured has its ``x``, ``y`` at the start and nothing else.
-    """
-
-    frames: NDArray[np.int64]
-    times_s: Floats | None
-    start: int
-    x: Floats
-    y: Floats
-    position: Floats
-    drift: Floats
-    closure: Floats
-    status: NDArray[np.uint8]
-    status_before: NDArray[np.uint8]
-    variables: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-
-    @property
-    def n_points(self) -> int:
-        """Number of points."""
-        return int(self.x.shape[1])
-
-    @property
-    def start_index(self) -> int:
-        """Index along the first axis of the frame in which the points were given."""
-        return int(np.flatnonzero(self.frames == self.start)[0])
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """[T, n]: whether a point is known in a frame."""
-        return np.isfinite(self.drift)
-
-    @property
-    def ways(self) -> tuple[list[int], list[int]]:
-        """Indices of the frames from the start ahead, and from the start back."""
-        at = self.start_index
-        return list(range(at, len(self.frames))), list(range(at, -1, -1))
-
-    def having(self, variables: Mapping[str, NDArray[Any]]) -> Tracks:
-        """The same with further ``variables``."""
-        return replace(self, variables={**self.variables, **variables})
-
-    def __repr__(self) -> str:
-        whole = int(self.known.all(axis=0).sum())
-        return (
-            f"<Tracks of {self.n_points} points from frame {self.start} through {self.frames[0]}..{self.frames[-1]}: "
-            f"{whole} in all frames>"
-        )
 
 
 def track(
@@ -153,9 +74,8 @@ def track(
     back = _Way.along(maps, first, range(at, -1, -1), times, max_drift)
     joined = [np.concatenate([b[:0:-1], a]) for a, b in zip(ahead.arrays, back.arrays, strict=True)]
     at_px, depth, drift, ends_apart = joined
-    position = np.stack([*((at_px - maps.principal[:, None]) / maps.f_px).swapaxes(0, 1), np.ones_like(depth)], axis=-1)
     return Tracks(
-        frames, store.times_s, start, at_px[:, 0], at_px[:, 1], position * depth[..., None], drift, ends_apart,
+        frames, store.times_s, start, at_px[:, 0], at_px[:, 1], maps.in_space(at_px, depth), drift, ends_apart,
         ahead.status, back.status,
     )  # fmt: skip
 

@@ -52,8 +52,8 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("exporters", "labels", "following", "region_noise", "regions", "diel"), 7),
     **dict.fromkeys(("napari_reader",), 7),
     **dict.fromkeys(("rig", "rig_choices", "inspection", "inspection_advice", "inspection_report"), 7),
-    **dict.fromkeys(("drift", "interpolation"), 3),
-    **dict.fromkeys(("point_maps", "tracking"), 7),
+    **dict.fromkeys(("drift", "interpolation", "neighbourhood"), 3),
+    **dict.fromkeys(("point_maps", "tracks", "tracking", "cumulative", "leaf_axes"), 7),
     **dict.fromkeys(("cli",), 8),
 }
 """Part of the package -> layer. A part imports from lower layers and, without cycles, from its own."""

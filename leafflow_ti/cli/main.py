@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
     "growth": ("growth:growth", "Measure growth and strain from the motion in a results store."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),
+    "track": ("track:track", "Follow points through the frames; growth and strain since the start."),
     "export": ("export:export", "Write results for Fiji, ParaView, MATLAB, R and other programs."),
     "regions": ("regions:regions", "Measure each leaf of a label image: area, motion, growth per hour, diel curve."),
     "profile": ("profile:profile", "Measure the stages of a run on this machine, and predict the whole."),

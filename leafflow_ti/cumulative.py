@@ -27,9 +27,10 @@ from leafflow_ti.drift import accumulated
 from leafflow_ti.errors import UsageError
 from leafflow_ti.interpolation import Cells, Lattice, Reading, Surface
 from leafflow_ti.mesh import STEEPEST
-from leafflow_ti.neighbourhood import Indices, pairs_within
+from leafflow_ti.neighbourhood import pairs_within
 from leafflow_ti.status import Status
-from leafflow_ti.tracking import Tracks, clock
+from leafflow_ti.tracking import clock
+from leafflow_ti.tracks import Tracks
 
 if TYPE_CHECKING:
     from leafflow_ti.results import ResultStore
@@ -39,6 +40,8 @@ Floats = NDArray[np.float64]
 RATES = {"growth_rate": "growth", "area_rate": "area_growth"}
 """Map of a rate -> name of what it adds up to."""
 STRAINS = ("strain_11", "strain_22", "strain_12", "strain_1", "strain_2", "strain_angle")
+INDEPENDENT = 0.1
+"""Correlation of errors below which estimates count as independent."""
 LEAST_POINTS, LEAST_SPREAD = 4, 0.02
 """Points of a fit, and the smaller of their principal moments as a part of the larger: less is a line."""
 
@@ -47,19 +50,27 @@ def track_growth(store: ResultStore, tracks: Tracks, gauge: float | None = None)
     """The tracks with their growth and strain since the start, as variables [T, n] in %.
 
     ``growth``, ``area_growth``, each with ``_std``, where the store holds such a rate; ``place_growth`` and ``STRAINS``
-    where it holds depth, of the points at most ``gauge`` / 2 px apart at the start (None: three times the distance of
-    neighbouring points).
+    where it holds depth, of the points at most ``gauge`` / 2 px apart at the start (None: see ``usual_gauge``).
     Raises UsageError for a gauge that is not positive.
     """
     if gauge is not None and not gauge > 0:
         raise UsageError(f"gauge = {gauge:g} px: must be positive")
-    found = {}
+    found: dict[str, Floats] = {}
     for rate, name in RATES.items():
         if rate in store.names:
             found |= _from_rates(store, tracks, rate, name)
     if np.isfinite(tracks.position[tracks.start_index]).any():
-        found |= strain_since(tracks, usual_gauge(tracks) if gauge is None else gauge)
+        found |= strain_since(tracks, usual_gauge(store, tracks) if gauge is None else gauge)
     return tracks.having(found)
+
+
+def usual_gauge(store: ResultStore, tracks: Tracks) -> float:
+    """Diameter [px] that holds three estimates across whose errors are nearly independent, and six points."""
+    noise, lattice = NoiseCorrelation.of(store).x, Lattice.of(store.x, store.y)
+    independent = int(np.argmax(noise < INDEPENDENT)) if (noise < INDEPENDENT).any() else noise.size
+    x, y = (at[tracks.start_index][tracks.known[tracks.start_index]] for at in (tracks.x, tracks.y))
+    area = float(np.ptp(x) * np.ptp(y)) if x.size > 1 else 0.0
+    return float(max(2 * independent * lattice.step[0], 6 * np.sqrt(area / max(x.size, 1)), 2))
 
 
 def _from_rates(store: ResultStore, tracks: Tracks, rate: str, name: str) -> dict[str, Floats]:
@@ -85,30 +96,25 @@ def _from_rates(store: ResultStore, tracks: Tracks, rate: str, name: str) -> dic
     return {name: 100 * np.expm1(total), f"{name}_std": 100 * np.exp(total) * total_std}
 
 
-def usual_gauge(tracks: Tracks) -> float:
-    """Three times the distance [px] at which points lie, were they spread evenly over where they are at the start."""
-    x, y = (at[tracks.start_index][tracks.known[tracks.start_index]] for at in (tracks.x, tracks.y))
-    if x.size < 2:
-        return 1.0
-    distance = np.sqrt(max(float(np.ptp(x) * np.ptp(y)), float(np.hypot(np.ptp(x), np.ptp(y)))) / x.size)
-    return float(6 * distance)
-
-
 def strain_since(tracks: Tracks, gauge: float) -> dict[str, Floats]:
-    """``place_growth`` and ``STRAINS`` [T, n] by the places of the points; %, the angle in rad from axis 1."""
+    """``place_growth`` and ``STRAINS`` [T, n] by the places of the points; %, the angle in rad from axis 1.
+
+    Beside them ``tangents`` [n, 3, 2]: the two axes at the start.
+    """
     at, shape = tracks.start_index, tracks.x.shape
     found = {name: np.full(shape, np.nan) for name in ("place_growth", *STRAINS)}
-    pairs = _pairs(tracks, gauge)
+    fit = _Fit(tracks, gauge)
+    axes = tangents(fit.slopes(tracks.position[at], tracks.position[at]))
     for k in range(shape[0]):
-        gradient = _gradient(tracks, pairs, tracks.position[at], tracks.position[k])
+        before, now = (fit.slopes(tracks.position[i], tracks.position[k]) for i in (at, k))
+        gradient = now @ _inverse(np.swapaxes(tangents(before), 1, 2) @ before)
         squared = np.swapaxes(gradient, -1, -2) @ gradient
         with np.errstate(invalid="ignore"):
             determinant = squared[:, 0, 0] * squared[:, 1, 1] - squared[:, 0, 1] ** 2
             found["place_growth"][k] = 100 * (np.sqrt(determinant) - 1)
-        tensor = 50 * (squared - np.eye(2))
-        for name, values in zip(STRAINS, _components(tensor), strict=True):
+        for name, values in zip(STRAINS, _components(50 * (squared - np.eye(2))), strict=True):
             found[name][k] = values
-    return found
+    return found | {"tangents": axes}
 
 
 def _components(tensor: Floats) -> tuple[Floats, ...]:
@@ -119,41 +125,41 @@ def _components(tensor: Floats) -> tuple[Floats, ...]:
     return one, two, both, mean + radius, mean - radius, np.where(angle >= np.pi / 2, angle - np.pi, angle)
 
 
-def _pairs(tracks: Tracks, gauge: float) -> tuple[Indices, Indices]:
-    """Pairs of points that are near each other at the start, and on one surface."""
-    x, y, position = (values[tracks.start_index] for values in (tracks.x, tracks.y, tracks.position))
-    known = np.isfinite(position[:, 2])
-    i, j = pairs_within(np.where(known, x, np.nan), y, gauge / 2)
-    apart = position[j] - position[i]
-    same = np.abs(apart[:, 2]) <= STEEPEST * np.hypot(apart[:, 0], apart[:, 1])
-    label = tracks.variables.get("label")
-    if label is not None:
-        same &= label[i] == label[j]
-    return i[same], j[same]
+class _Fit:
+    """Planes through the places of the points around each, over the image at the start."""
 
+    def __init__(self, tracks: Tracks, gauge: float):
+        x, y, position = (values[tracks.start_index] for values in (tracks.x, tracks.y, tracks.position))
+        i, j = pairs_within(np.where(np.isfinite(position[:, 2]), x, np.nan), y, gauge / 2)
+        apart = position[j] - position[i]
+        same = np.abs(apart[:, 2]) <= STEEPEST * np.hypot(apart[:, 0], apart[:, 1])
+        label = tracks.variables.get("label")
+        if label is not None:
+            same &= label[i] == label[j]
+        self._pairs, self._n = (i[same], j[same]), x.size
+        self._at = np.stack([x, y], axis=1)
 
-def _gradient(tracks: Tracks, pairs: tuple[Indices, Indices], before: Floats, now: Floats) -> Floats:
-    """Deformation gradients F [n, 3, 2] along the start's tangents, NaN where too few neighbours are known now."""
-    n = tracks.n_points
-    alive = np.isfinite(now[:, 2])
-    i, j = (p[alive[pairs[0]] & alive[pairs[1]]] for p in pairs)
-    at = np.stack([tracks.x[tracks.start_index], tracks.y[tracks.start_index]], axis=1)
-    offset, values = at[j] - at[i], np.concatenate([before[j] - before[i], now[j] - now[i]], axis=1)
+    def slopes(self, places: Floats, now: Floats) -> Floats:
+        """Derivatives along x and y [n, 3, 2] of ``places`` [n, 3], by the points that are known ``now`` [n, 3].
 
-    def total(v: Floats) -> Floats:
-        return np.bincount(i, v, minlength=n)
+        NaN where these are too few, or on a line.
+        """
+        alive = np.isfinite(now[:, 2])
+        i, j = (p[alive[self._pairs[0]] & alive[self._pairs[1]]] for p in self._pairs)
+        offset, values = self._at[j] - self._at[i], places[j] - places[i]
 
-    count = total(np.ones(i.size))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.stack([total(offset[:, a]) for a in (0, 1)], axis=1) / count[:, None]
-        d = offset - mean[i]
-        xx, yy, xy = total(d[:, 0] ** 2), total(d[:, 1] ** 2), total(d[:, 0] * d[:, 1])
-        det = xx * yy - xy**2
-        determined = (count >= LEAST_POINTS) & (det > LEAST_SPREAD * (0.5 * (xx + yy)) ** 2)
-        c = np.stack([yy[i] * d[:, 0] - xy[i] * d[:, 1], xx[i] * d[:, 1] - xy[i] * d[:, 0]], axis=1) / det[i, None]
-    slopes = np.stack([[total(c[:, a] * v) for v in values.T] for a in (0, 1)]).transpose(2, 1, 0)  # [n, 6, 2]
-    slopes[~determined] = np.nan
-    return np.asarray(slopes[:, 3:] @ _inverse(np.swapaxes(tangents(slopes[:, :3]), 1, 2) @ slopes[:, :3]))
+        def total(v: Floats) -> Floats:
+            return np.bincount(i, v, minlength=self._n).astype(np.float64)
+
+        count = total(np.ones(i.size))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            d = offset - np.stack([total(offset[:, a]) / count for a in (0, 1)], axis=1)[i]
+            xx, yy, xy = total(d[:, 0] ** 2), total(d[:, 1] ** 2), total(d[:, 0] * d[:, 1])
+            det = xx * yy - xy**2
+            c = np.stack([yy[i] * d[:, 0] - xy[i] * d[:, 1], xx[i] * d[:, 1] - xy[i] * d[:, 0]], axis=1) / det[i, None]
+        found = np.stack([np.stack([total(c[:, a] * v) for v in values.T], axis=1) for a in (0, 1)], axis=2)
+        found[(count < LEAST_POINTS) | ~(det > LEAST_SPREAD * (0.5 * (xx + yy)) ** 2)] = np.nan
+        return np.asarray(found)
 
 
 def tangents(element: Floats) -> Floats:
