@@ -86,12 +86,10 @@ class Page:
 
     def drag(self, x: float, y: float, dx: float, dy: float) -> None:
         """Press the mouse at a point of the window, move it, let go."""
-        for kind, at in (
-            ("mousePressed", (x, y)),
-            ("mouseMoved", (x + dx, y + dy)),
-            ("mouseReleased", (x + dx, y + dy)),
-        ):
-            self.call("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], button="left", buttons=1, clickCount=1)
+        points = {"mousePressed": (x, y), "mouseMoved": (x + dx, y + dy), "mouseReleased": (x + dx, y + dy)}
+        for kind, (at_x, at_y) in points.items():
+            options = {"button": "left", "buttons": 1, "clickCount": 1}
+            self.call("Input.dispatchMouseEvent", type=kind, x=at_x, y=at_y, **options)
 
     def press(self, key: str) -> None:
         """A key, by its name in JavaScript."""

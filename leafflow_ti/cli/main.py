@@ -19,7 +19,7 @@ from leafflow_ti.errors import LeafflowError
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": (
         "demo:demo",
-        "Simulate a rotating cube, measure it, compare with the truth, draw pictures: no input needed.",
+        "Simulate a rotating cube, measure it, compare with the truth, write a report: no input needed.",
     ),
     "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube)."),
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),

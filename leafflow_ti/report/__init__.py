@@ -7,6 +7,7 @@ The page holds all it needs, asks for nothing over the network (its content poli
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import json
 import os
@@ -18,12 +19,13 @@ from typing import Any
 
 from leafflow_ti import __version__
 from leafflow_ti.errors import InputError, RunError, UsageError
+from leafflow_ti.number_text import duration
 from leafflow_ti.panels import panels_of
 from leafflow_ti.report.facts import Facts, precision_of, spread_evenly
 from leafflow_ti.report.maps import Shown, maps_section
-from leafflow_ti.report.numbers import duration
 from leafflow_ti.report.regions_table import RegionCurves, read_region_curves
 from leafflow_ti.report.sections import (
+    frame_numbers,
     growth_section,
     header,
     quality_section,
@@ -75,9 +77,9 @@ def write_report(
         scratch.write_text(page, encoding="utf-8")
         scratch.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            scratch.unlink(missing_ok=True)
         raise RunError(f"{path}: the report cannot be written ({error.strerror}): name another file") from error
-    finally:
-        scratch.unlink(missing_ok=True)
     return path
 
 
@@ -161,8 +163,8 @@ def _labels(store: ResultStore, shown: Shown) -> list[str]:
 
 def _footer(store: ResultStore, shown: Shown) -> str:
     n = len(store.frames)
-    numbers = ", ".join(str(store.frames[t]) for t in shown.indices)
-    of = f" Maps and surface: frames {numbers} of {n}." if len(shown.indices) < n else ""
+    numbers = frame_numbers([field.frame for field in shown.fields])
+    of = f" Maps and surface show {numbers}, the curves all {n}." if len(shown.fields) < n else ""
     return (
         f"<footer>Written by leafflow-ti {escape(__version__)} from <code>{escape(store.path.name)}</code>.{of} "
         "x right, y down, Z away from the camera; errors are standard errors.</footer>"

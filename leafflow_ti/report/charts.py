@@ -11,8 +11,8 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.number_text import axis_labels, round_steps
 from leafflow_ti.report.facts import Series
-from leafflow_ti.report.numbers import axis_labels, round_steps
 
 WIDTH, HEIGHT = 480, 250
 LEFT, RIGHT, TOP, BOTTOM = 58, 12, 14, 44
@@ -53,13 +53,18 @@ class _Axes:
 
 
 def curves(
-    series: Sequence[Series], x_label: str, y_label: str, title: str, marks: Sequence[float], floor: float | None = None
+    series: Sequence[Series],
+    x_label: str,
+    y_label: str,
+    title: str,
+    marks: Sequence[float],
+    limits: tuple[float, float] | None = None,
 ) -> str:
     """Means over x with bands of one standard error; the pixels' spread behind it where one curve stands alone.
 
-    ``marks``: where along x the frames of the page's slider are; ``floor``: what the axis upwards starts with.
+    ``marks``: where along x the frames of the page's slider are; ``limits``: of the axis upwards, else what is shown.
     """
-    axes = _Axes(_span([s.x for s in series]), _limits(series, floor))
+    axes = _Axes(_span([s.x for s in series]), limits or _limits(series))
     parts = axes.frame(x_label, y_label)
     if len(series) == 1 and series[0].spread is not None:
         low, high = series[0].spread
@@ -81,7 +86,7 @@ def stage_bars(seconds: Sequence[tuple[str, float, str]], title: str) -> str:
     for i, (name, value, text) in enumerate(seconds):
         y, width = i * pitch + 3, max(1.0, round((WIDTH - name_width - value_width) * value / most, 1))
         parts.append(f'<text class="end" x="{name_width - 8}" y="{y + 15}">{escape(name)}</text>')
-        parts.append(f'<rect class="bar" x="{name_width}" y="{y}" width="{width}" height="{pitch - 6}" rx="3"/>')
+        parts.append(f'<rect class="stage-bar" x="{name_width}" y="{y}" width="{width}" height="{pitch - 6}" rx="3"/>')
         parts.append(f'<text x="{name_width + width + 7}" y="{y + 15}">{escape(text)}</text>')
     return _svg(parts, title, len(seconds) * pitch + 2)
 
@@ -131,14 +136,14 @@ def _span(arrays: Sequence[Floats]) -> tuple[float, float]:
     return (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
 
 
-def _limits(series: Sequence[Series], floor: float | None) -> tuple[float, float]:
-    """Of the axis upwards: all bands, and a little more."""
+def _limits(series: Sequence[Series]) -> tuple[float, float]:
+    """All bands, and a little more."""
     shown = [s.mean + sign * s.error for s in series for sign in (-1, 1)]
     if len(series) == 1 and series[0].spread is not None:
         shown.append(series[0].spread)
     low, high = _span(shown)
     margin = 0.06 * (high - low)
-    return (low - margin if floor is None else floor, high + margin)
+    return low - margin, high + margin
 
 
 def _apart(low: float, high: float) -> tuple[float, float]:

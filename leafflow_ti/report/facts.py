@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.correlation import NoiseCorrelation
+from leafflow_ti.display import Medians
 from leafflow_ti.field import WITHOUT_STD
 from leafflow_ti.panels import shown_in
 from leafflow_ti.results import ResultStore
@@ -50,13 +51,11 @@ class Series:
 
 @dataclass(frozen=True)
 class Precision:
-    """A map in the frames shown: medians of the values and of their standard errors, share of pixels with a value."""
+    """A map in the frames shown, in ``unit``."""
 
     name: str
     unit: str
-    median: float
-    error: float | None
-    valid: float
+    medians: Medians
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,18 +107,13 @@ def precision_of(store: ResultStore, frames: Sequence[int]) -> list[Precision]:
     """Medians of every map over these frames (indices along t), maps without any value left out."""
     found = []
     for name in (n for n in store.names if not n.endswith("_std") and n not in WITHOUT_STD):
-        values = np.concatenate([store.read(name, t).ravel() for t in frames])
-        known = np.isfinite(values)
-        if not known.any():
+        values = np.concatenate([store.read(name, t) for t in frames])
+        if not np.isfinite(values).any():
             continue
-        error = None
-        if f"{name}_std" in store.names:
-            errors = np.concatenate([store.read(f"{name}_std", t).ravel() for t in frames])[known]
-            error = float(np.median(errors[np.isfinite(errors)])) if np.isfinite(errors).any() else None
+        std = f"{name}_std"
+        errors = np.concatenate([store.read(std, t) for t in frames]) if std in store.names else None
         unit, factor = shown_in(name, store.interval_s)
-        found.append(
-            Precision(name, unit, float(np.median(values[known])) * factor, error and error * factor, known.mean())
-        )
+        found.append(Precision(name, unit, Medians.of(values * factor, None if errors is None else errors * factor)))
     return found
 
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from leafflow_ti.colours import STATUS_COLOURS, Scale, data_uri, normal_disc, rgba_png
 from leafflow_ti.field import Field
+from leafflow_ti.number_text import readable
 from leafflow_ti.panels import PAGES, Panel, arrows_of, extent, panels_of
-from leafflow_ti.report.numbers import readable
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 
@@ -117,8 +117,8 @@ def legend(panel: Panel, scale: Scale | None) -> str:
     if panel.kind == "normals":
         disc = data_uri(rgba_png(normal_disc(64)))
         return (
-            f'<div class="key"><img src="{disc}" width="44" height="44" alt="disc of colours">'
-            "<span>The disc shows all directions: its middle faces the camera, its rim is seen edge-on.</span></div>"
+            f'<div class="disc"><img src="{disc}" width="44" height="44" alt="disc of colours">'
+            "<span>All directions: the disc's middle faces the camera, its rim is seen edge-on.</span></div>"
         )
     return ""
 
@@ -175,7 +175,7 @@ def _figure(shown: Shown, panel: Panel) -> str:
         f'<figure data-panel="{escape(panel.key)}"><figcaption><b>{escape(panel.title)}</b>'
         f"<span>{escape(panel.long_name)}</span></figcaption>"
         f'<div class="plate"><img src="{shown.images[panel.key][shown.start]}" width="{columns}" height="{rows}" '
-        f'alt="{alt}">{overlay}</div>{key}</figure>'
+        f'alt="{alt}">{overlay}</div><div class="key">{key}</div></figure>'
     )
 
 

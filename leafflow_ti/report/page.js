@@ -31,8 +31,7 @@
     ruler.hidden = false;
     const colour = () => {
       const shown = figures.find((f) => f.key === select.value);
-      const kept = [...shown.figure.children].filter((part) => !part.matches("figcaption, .plate"));
-      byId("scale").replaceChildren(...kept.map((part) => part.cloneNode(true)));
+      byId("scale").replaceChildren(shown.figure.querySelector(".key").cloneNode(true));
       paint();
     };
     const setArrows = () => {

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from leafflow_ti.colours import STATUS_COLOURS
+from leafflow_ti.number_text import duration, readable, to_digits_of, with_error
 from leafflow_ti.panels import quantity_title
 from leafflow_ti.report.charts import COLOURS, curves, stage_bars
 from leafflow_ti.report.facts import Facts, Precision, Series
 from leafflow_ti.report.maps import Shown, status_name, swatch
-from leafflow_ti.report.numbers import duration, readable, to_digits_of, with_error
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import ADVICE
 from leafflow_ti.trace import STAGES
@@ -51,9 +51,9 @@ def tiles(store: ResultStore, facts: Facts, precision: Sequence[Precision]) -> s
     distance = "depth" if "depth" in by_name else "disparity"
     for name, text in ((distance, distance.capitalize()), ("velocity_z", "Velocity away from the camera")):
         if name in by_name:
-            p = by_name[name]
-            error = "" if p.error is None else f"median; standard error {readable(p.error, 2)} {p.unit}"
-            found.append((text, to_digits_of(p.median, p.error), p.unit, error))
+            unit, medians = by_name[name].unit, by_name[name].medians
+            error = "" if medians.error is None else f"; standard error {readable(medians.error, 2)} {unit}"
+            found.append((text, to_digits_of(medians.value, medians.error), unit, f"median{error}"))
     measured = facts.measured[np.isfinite(facts.measured)]
     found.append(("Measured", readable(100 * float(measured.mean())), "%", "of the pixels, with error bars"))
     found.append(("Frames", f"{int((facts.done == 1).sum())}", f"of {len(store.frames)}", "done"))
@@ -125,8 +125,8 @@ def quality_section(store: ResultStore, facts: Facts, precision: Sequence[Precis
     total = sum(facts.statuses.values())
     ordered = sorted(facts.statuses.items(), key=lambda item: -item[1])
     stack = "".join(
-        f'<span style="width:{n / max(total, 1):.3%};background:{STATUS_COLOURS[code]}" '
-        f'title="{status_name(code)} {n / max(total, 1):.1%}"></span>'
+        f'<span style="width:{n / total:.3%};background:{STATUS_COLOURS[code]}" '
+        f'title="{status_name(code)} {n / total:.1%}"></span>'
         for code, n in ordered
     )
     rows = "".join(
@@ -134,18 +134,18 @@ def quality_section(store: ResultStore, facts: Facts, precision: Sequence[Precis
         f'<td class="n">{n / total:.1%}</td><td>{escape(ADVICE[code])}</td></tr>'
         for code, n in ordered
     )
-    words = ", ".join(f"{status_name(code)} {n / max(total, 1):.1%}" for code, n in ordered)
+    words = ", ".join(f"{status_name(code)} {n / total:.1%}" for code, n in ordered)
     coverage = Series("measured", np.array(store.frames, float), 100 * facts.measured, np.zeros(len(store.frames)))
-    chart = curves(
-        [coverage], "frame", "% of the pixels", "share of the pixels measured, per frame", _marks(shown), 0.0
-    )
+    said = "share of the pixels measured in each frame"
+    chart = curves([coverage], "frame", "% of the pixels", said, _marks(shown), (0, 100))
     accuracy = "".join(
-        f'<tr><td>{escape(quantity_title(p.name))}</td><td class="n">{to_digits_of(p.median, p.error)}</td>'
-        f'<td class="n">{"–" if p.error is None else readable(p.error, 2)}</td>'
-        f'<td>{escape("" if p.unit == "1" else p.unit)}</td><td class="n">{p.valid:.1%}</td></tr>'
+        f'<tr><td>{escape(quantity_title(p.name))}</td><td class="n">{to_digits_of(m.value, m.error)}</td>'
+        f'<td class="n">{"–" if m.error is None else readable(m.error, 2)}</td>'
+        f'<td>{escape("" if p.unit == "1" else p.unit)}</td><td class="n">{m.valid:.1%}</td></tr>'
         for p in precision
+        for m in (p.medians,)
     )
-    listed = _numbers([field.frame for field in shown.fields])
+    listed = frame_numbers([field.frame for field in shown.fields])
     return f"""<h2>Quality</h2>
 <h3>What became of the pixels</h3>
 <div class="stack" role="img" aria-label="{escape(words)}">{stack}</div>
@@ -188,9 +188,12 @@ def _marks(shown: Shown) -> list[float]:
     return [float(field.frame) for field in shown.fields]
 
 
-def _numbers(frames: Sequence[int]) -> str:
+def frame_numbers(frames: Sequence[int]) -> str:
+    """``frames 3 to 9`` or ``frames 3, 7 and 12``."""
     if len(frames) == 1:
         return f"frame {frames[0]}"
+    if frames[-1] - frames[0] == len(frames) - 1:
+        return f"frames {frames[0]} to {frames[-1]}"
     return f"frames {', '.join(str(f) for f in frames[:-1])} and {frames[-1]}"
 
 
@@ -209,8 +212,8 @@ def _settings(config: Mapping[str, Any], attrs: Mapping[str, Any]) -> list[tuple
     refined = f"{refine.get('steps')} steps, window {refine.get('window')} px" if refine.get("steps") else "none"
     camera = ""
     if "f_px" in plan:
-        step = " × ".join(f"{b:g}" for b in plan["baseline_mm"])
-        camera = f"focal length {plan['f_px']:g} px, camera step {step} mm"
+        steps = " and ".join(f"{b:g} mm along {axis}" for b, axis in zip(plan["baseline_mm"], "xy", strict=True) if b)
+        camera = f"focal length {plan['f_px']:g} px, camera step {steps}"
     files = f"{given['files']} files" if "files" in given else ""
     checksum = str(given.get("names_and_sizes_sha256", ""))[:12]
     packages = {"leafflow-ti": attrs.get("leafflow_ti_version", "")} | dict(versions)

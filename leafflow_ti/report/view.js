@@ -2,10 +2,10 @@
 
 const VERTEX = `#version 300 es
 in vec3 point; in vec3 normal; in vec2 place;
-uniform mat3 turn; uniform vec3 middle; uniform vec2 move; uniform vec2 zoom; uniform float depth;
+uniform mat3 turn; uniform vec3 middle; uniform vec2 move; uniform vec2 zoom; uniform float depth; uniform float swell;
 out vec3 facing; out vec2 at;
 void main() {
-  vec3 p = turn * (point - middle);
+  vec3 p = turn * (point + swell * normal - middle);
   facing = turn * normal;
   at = place;
   gl_Position = vec4((p.xy + move) * zoom, -p.z * depth, 1.0);
@@ -52,7 +52,7 @@ class SurfaceView {
     Object.assign(this, { canvas, data, gl, onDraw, cache: new Map(), pending: false });
     this.program = this.compiled();
     this.uniform = Object.fromEntries(
-      ["turn", "middle", "move", "zoom", "depth", "paint"].map((name) => [name, gl.getUniformLocation(this.program, name)]));
+      ["turn", "middle", "move", "zoom", "depth", "swell", "paint"].map((name) => [name, gl.getUniformLocation(this.program, name)]));
     this.mesh = this.layout();
     this.shafts = this.layout();
     this.texture = gl.createTexture();
@@ -131,7 +131,7 @@ class SurfaceView {
 
   /** Length of an arrow [mm] for a motion of 1 mm/frame. */
   get magnification() {
-    const typical = this.data.speed > 0 ? (0.12 * this.radius) / this.data.speed : 1;
+    const typical = this.data.speed > 0 ? (0.25 * this.radius) / this.data.speed : 1;
     const power = 10 ** Math.floor(Math.log10(typical)), lead = typical / power;
     return (lead >= 5 ? 5 : lead >= 2 ? 2 : 1) * power * 2 ** this.stretch;
   }
@@ -139,7 +139,7 @@ class SurfaceView {
   setArrows() {
     if (!this.surface) return;
     const spans = this.surface.motion.map((v) => v * this.magnification);
-    const [points, normals] = arrowTriangles(this.surface.tails, spans, 0.0055 * this.radius);
+    const [points, normals] = arrowTriangles(this.surface.tails, spans, 0.007 * this.radius);
     this.corners = points.length / 3;
     this.fill(this.shafts, [points, normals, new Float32Array(2 * this.corners)]);
     this.redraw();
@@ -161,7 +161,7 @@ class SurfaceView {
 
   /** Pixels of the page per mm. */
   get scale() {
-    return (this.magnify * 0.5 * Math.min(this.canvas.clientWidth, this.canvas.clientHeight)) / (1.05 * this.radius);
+    return (this.magnify * 0.5 * Math.min(this.canvas.clientWidth, this.canvas.clientHeight)) / this.radius;
   }
 
   draw() {
@@ -180,12 +180,20 @@ class SurfaceView {
     gl.uniform2f(uniform.zoom, (2 * this.scale) / canvas.clientWidth, (2 * this.scale) / canvas.clientHeight);
     gl.uniform1f(uniform.depth, 0.1 / this.radius);
     gl.uniform4f(uniform.paint, 0, 0, 0, 0);
+    gl.uniform1f(uniform.swell, 0);
     gl.bindVertexArray(this.mesh.array);
     gl.drawElements(gl.TRIANGLES, this.indices, gl.UNSIGNED_INT, 0);
     if (this.withArrows && this.corners) {
-      gl.uniform4f(uniform.paint, 0.1, 0.1, 0.12, 1);
       gl.bindVertexArray(this.shafts.array);
-      gl.drawArrays(gl.TRIANGLES, 0, this.corners);
+      gl.enable(gl.CULL_FACE);
+      // Dark arrows with a light rim, the inside of slightly thicker ones, are seen on any colour.
+      for (const [grey, side, swell] of [[1.35, gl.FRONT, 0.004 * this.radius / Math.sqrt(this.magnify)], [0.12, gl.BACK, 0]]) {
+        gl.cullFace(side);
+        gl.uniform1f(uniform.swell, swell);
+        gl.uniform4f(uniform.paint, grey, grey, grey, 1);
+        gl.drawArrays(gl.TRIANGLES, 0, this.corners);
+      }
+      gl.disable(gl.CULL_FACE);
     }
     gl.bindVertexArray(null);
     this.onDraw(this);

@@ -20,7 +20,9 @@ def with_error(value: float, error: float) -> str:
     """Value and standard error, both to the error's second digit: ``0.412 ± 0.013``."""
     if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
         return readable(value)
-    decimals = min(max(0, 1 - math.floor(math.log10(error))), 9)
+    decimals = max(0, 1 - math.floor(math.log10(error)))
+    if decimals > 6:
+        return f"{readable(value, 2)} ± {readable(error, 2)}"
     return f"{value:.{decimals}f} ± {error:.{decimals}f}".replace("-", "−")
 
 
@@ -49,10 +51,10 @@ def axis_labels(steps: Sequence[float]) -> list[str]:
 
 
 def duration(seconds: float) -> str:
-    """``45 s``, ``3 min 20 s``, ``2 h 05 min``, ``3 d 04 h``."""
+    """``0.12 s``, ``45 s``, ``3 min 20 s``, ``2 h 05 min``, ``3 d 04 h``; a rest of 0 is left out."""
     total = round(seconds)
     for unit, smaller, size, part in (("d", "h", 86400, 3600), ("h", "min", 3600, 60), ("min", "s", 60, 1)):
         if total >= size:
             rest = total % size // part
             return f"{total // size} {unit}" + (f" {rest:02d} {smaller}" if rest else "")
-    return f"{seconds:.3g} s"
+    return f"{total} s" if seconds >= 10 or not seconds else f"{seconds:.2g} s"
