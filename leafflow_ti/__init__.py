@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from leafflow_ti.results import ResultStore
     from leafflow_ti.rig import Rig, plan_rig
     from leafflow_ti.surface_growth import measure_growth
-    from leafflow_ti.tracking import Tracks, track
     from leafflow_ti.tracking import track
     from leafflow_ti.tracks import Tracks
 
