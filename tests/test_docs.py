@@ -11,10 +11,10 @@ from typing import Any
 import matplotlib
 import pytest
 from documentation import PAGES, README, ROOT, Session, agree, blocks, calls
+from program import commands, help_of
 from pydantic import BaseModel
 
 import leafflow_ti
-from docs._ext.program import commands, help_of
 from leafflow_ti.capture.description import Description
 from leafflow_ti.cli.main import COMMANDS, invoke
 from leafflow_ti.config import RunConfig
