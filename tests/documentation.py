@@ -70,7 +70,13 @@ def blocks(page: Path) -> list[Block]:
 
 def calls(block: Block) -> Iterator[Call]:
     """The command lines of a block: those behind ``$``, or every line of a block without a language."""
-    lines = list(enumerate(block.text.splitlines(), block.line))
+    lines: list[tuple[int, str]] = []
+    for number, text in enumerate(block.text.splitlines(), block.line):
+        if lines and lines[-1][1].endswith("\\"):
+            begin, before = lines[-1]
+            lines[-1] = (begin, before[:-1] + text)
+        else:
+            lines.append((number, text))
     if not block.language:
         lines = [(number, f"$ {part}") for number, line in lines for part in line.split(" && ")]
     starts = [at for at, (_, line) in enumerate(lines) if line.startswith("$ ")]

@@ -11,10 +11,10 @@ from typing import Any
 import matplotlib
 import pytest
 from documentation import PAGES, README, ROOT, Session, agree, blocks, calls
+from program import commands, help_of
 from pydantic import BaseModel
 
 import leafflow_ti
-from docs._ext.program import commands, help_of
 from leafflow_ti.capture.description import Description
 from leafflow_ti.cli.main import COMMANDS, invoke
 from leafflow_ti.config import RunConfig
@@ -128,9 +128,11 @@ def test_shown_output_is_compared() -> None:
 
 def test_calls_are_found_with_their_output(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    page.write_text("text\n\n```console\n$ leafflow-ti info a  # why\nframes 3\n\n$ make test\n```\n", encoding="utf-8")
+    text = "text\n\n```console\n$ leafflow-ti info \\\n  a  # why\nframes 3\n\n$ make test\n```\n"
+    page.write_text(text, encoding="utf-8")
     (block,) = blocks(page)
     first, second = calls(block)
     assert first.words == ("leafflow-ti", "info", "a")
     assert first.shown == ("frames 3",)
-    assert (first.line, second.words) == (4, ("make", "test"))
+    assert second.words == ("make", "test")
+    assert first.line == 4

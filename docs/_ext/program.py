@@ -38,6 +38,7 @@ class Commands(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """The sections."""
+        self.env.note_reread()  # the program may change without the page
         return [self._section(words) for words in commands()]
 
     def _section(self, words: tuple[str, ...]) -> nodes.section:
@@ -55,6 +56,7 @@ class PublicNames(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """The documentation of the names in alphabetical order."""
+        self.env.note_reread()
         classes = {"functions": False, "classes": True}[self.arguments[0]]
         entry = ".. autoclass:: leafflow_ti.{}\n   :members:\n" if classes else ".. autofunction:: leafflow_ti.{}\n"
         names = (name for name in sorted(leafflow_ti.__all__) if inspect.isclass(getattr(leafflow_ti, name)) is classes)
