@@ -212,7 +212,8 @@ def measure_theirs(triple: Triple, method: Method) -> Measured | str:
             np.savez(images, images=triple.images)
             script = Path(__file__).with_name("strain_programs.py")
             command = [python, str(script), method.program, json.dumps(method.settings), str(images), str(out)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            # pyvale writes a log where it is started.
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
             if done.returncode == 0:
                 with np.load(out) as file:
                     return Measured(**{name: file[name] for name in file.files if name != "seconds"},
