@@ -18,6 +18,7 @@ from leafflow_ti.background import Behind
 from leafflow_ti.bands import WRITE_BEHIND
 from leafflow_ti.capture import Capture, open_capture
 from leafflow_ti.config import RunConfig, load_config
+from leafflow_ti.correlation import stated_correlation
 from leafflow_ti.errors import RunError
 from leafflow_ti.field import Field, empty_map, status_counts
 from leafflow_ti.pipeline import Pipeline
@@ -196,6 +197,8 @@ def _provenance(plan: Plan, capture: Capture, device: Device, contents: bool = T
             "preshift_px": "adaptive" if plan.adaptive else list(plan.preshift),
             "f_px": g.f_px, "principal_px": list(g.principal_px), "baseline_mm": list(g.baseline_mm),
             "disparity_offset_px": list(g.disparity_offset_px), "time_offset": plan.time_offset,
+            "image_px": [capture.width, capture.height],
+            "noise_correlation": stated_correlation(plan),
         },
         "leafflow_ti_version": __version__,
         "versions": {"python": platform.python_version()} | {p: installed(p) for p in ("taichi", "numpy", "zarr")},

@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.field import FLOW_GRADIENT_NAMES, IDENTIFIED, MOTION_NAMES, PLANE_STRAIN_NAMES, QUANTITIES
+from leafflow_ti.field import (
+    CORRELATIONS,
+    FLOW_GRADIENT_NAMES,
+    IDENTIFIED,
+    MOTION_NAMES,
+    PLANE_STRAIN_NAMES,
+    QUANTITIES,
+)
 from leafflow_ti.status import HAS_VALUE, Status
 
 Array = NDArray[Any]
@@ -84,6 +91,9 @@ def settle(maps: MutableMapping[str, Array], status: NDArray[np.uint8], limits: 
             if name == "depth":
                 depth = maps["depth"]  # NaN, which no standard error is below, where it is not determined
         identified[whole] |= IDENTIFIED[group]
+        for name in CORRELATIONS if group == "translation" else ():
+            if name in maps:
+                maps[name][measured & ~whole] = np.nan
     aperture = status == Status.APERTURE
     for name in _NORMAL_FLOW:
         if name in maps:

@@ -22,7 +22,7 @@ from leafflow_ti.capture import (
 )
 from leafflow_ti.config import RunConfig, resolve
 from leafflow_ti.errors import ConfigError
-from leafflow_ti.field import FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, QUANTITIES, with_std
+from leafflow_ti.field import CORRELATIONS, FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, QUANTITIES, with_std
 from leafflow_ti.identify import Limits
 from leafflow_ti.model_plan import cameras_read, check_model, fitted_motion, model_problem, sampling_of, static
 from leafflow_ti.models import MODELS, TensorLayout
@@ -144,6 +144,8 @@ class Plan:
         names += [WORLD_MAPS[o] for o in problem.world_brightness]
         if "depth" in names and problem.unknowns >= 3:
             names.append("growth_rate")
+        if problem.unknowns >= 2:
+            names += CORRELATIONS if problem.unknowns >= 3 else CORRELATIONS[:1]
         names.append("confidence")
         names += ["support"] if ESTIMATORS[problem.estimator].robust else []
         return (*names, "identified")

@@ -11,7 +11,14 @@ from dataclasses import dataclass
 
 from leafflow_ti.config import RunConfig
 from leafflow_ti.errors import ConfigError
-from leafflow_ti.field import FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, STRAIN_NAMES
+from leafflow_ti.field import (
+    CORRELATIONS,
+    FLOW_GRADIENT_NAMES,
+    MOTION_NAMES,
+    PLANE_STRAIN_NAMES,
+    PRINCIPAL_NAMES,
+    STRAIN_NAMES,
+)
 from leafflow_ti.models import MODELS
 from leafflow_ti.presets import REFINED_WINDOW
 from leafflow_ti.sampling import AxisSampling
@@ -94,12 +101,15 @@ class Refinement:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Maps that are measured, in the order of the unknowns; strain rates stand behind the growth they make up."""
+        """Maps that are measured, in the order of the unknowns; strain rates and their principal axes stand behind the
+        growth they make up, correlations behind all."""
         if self.flat:
-            return tuple(n for n in _FLAT_NAMES if n not in self.excluded)
+            axes = PRINCIPAL_NAMES if self.modes == 3 else ()
+            return (*(n for n in _FLAT_NAMES if n not in self.excluded), *axes)
         growth = ("growth_rate",) if self.modes else ()
-        strain = STRAIN_NAMES if self.modes == 3 else ()
-        return ("depth", "slope_x", "slope_y", *MOTION_NAMES[: self.motion], *growth, *strain)
+        strain = (*STRAIN_NAMES, *PRINCIPAL_NAMES) if self.modes == 3 else ()
+        correlations = CORRELATIONS if self.motion else ()
+        return ("depth", "slope_x", "slope_y", *MOTION_NAMES[: self.motion], *growth, *strain, *correlations)
 
     @property
     def excluded(self) -> frozenset[str]:

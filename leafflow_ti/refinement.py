@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.capture import Geometry
-from leafflow_ti.field import FLOW_GRADIENT_NAMES, MOTION_NAMES, STRAIN_NAMES
+from leafflow_ti.field import CORRELATIONS, FLOW_GRADIENT_NAMES, MOTION_NAMES, PRINCIPAL_NAMES, STRAIN_NAMES
+from leafflow_ti.principal import principal_axes
 from leafflow_ti.refine_plan import Effort, Refinement
 from leafflow_ti.stages.refine import Refined, RefineStage
 from leafflow_ti.status import Status
@@ -95,6 +96,9 @@ def _enter(
         for full, found_values in ((name, values), (f"{name}_std", std)):
             if full in maps:
                 maps[full][rows, cols] = found_values
+    for name, values in _correlations(covariance).items():
+        if name in maps:
+            maps[name][rows, cols] = values
 
 
 def refine_middle(stage: RefineStage) -> Refined:
@@ -212,7 +216,28 @@ def _flat_maps(plan: Refinement, q: Array, covariance: Array) -> dict[str, tuple
         "strain_xx": {one: 100.0}, "strain_yy": {two: 100.0}, "strain_xy": {both: 100.0},
     }  # fmt: skip
     spread = _Spread(covariance)
-    return {name: spread.rate(q, sums[name]) for name in plan.names}
+    found = {name: spread.rate(q, gradient) for name, gradient in sums.items() if name in plan.names}
+    return found | (_principal(q, covariance) if plan.modes == 3 else {})
+
+
+def _principal(q: Array, covariance: Array) -> dict[str, tuple[Array, Array]]:
+    """Principal strain rates and their direction [n]; no values where one of the rates is not determined."""
+    rates = slice(_GROWTH, _GROWTH + 3)
+    spread = covariance[:, rates, rates]
+    lost = np.any(np.diagonal(spread, axis1=1, axis2=2) < 0, axis=1, keepdims=True)
+    values, std = principal_axes(100 * q[:, rates], 1e4 * spread)
+    values, std = np.where(lost, np.nan, values), np.where(lost, np.inf, std)
+    return {name: (values[:, k], std[:, k]) for k, name in enumerate(PRINCIPAL_NAMES)}
+
+
+def _correlations(covariance: Array) -> Maps:
+    """Correlations [n] between the errors of the velocity's components, from the covariance of the parameters."""
+    velocity = covariance[:, 3:6, 3:6]
+    std = np.sqrt(np.maximum(np.diagonal(velocity, axis1=1, axis2=2), 0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = velocity / (std[:, :, None] * std[:, None, :])
+    pairs = ((0, 1), (0, 2), (1, 2))
+    return {name: np.clip(found[:, i, j], -1, 1) for name, (i, j) in zip(CORRELATIONS, pairs, strict=True)}
 
 
 def _derived(plan: Refinement, q: Array, covariance: Array, rays: Array, f: float) -> dict[str, tuple[Array, Array]]:
@@ -234,4 +259,5 @@ def _derived(plan: Refinement, q: Array, covariance: Array, rays: Array, f: floa
     if plan.modes == 3:
         for i, name in enumerate(STRAIN_NAMES):
             found[name] = spread.rate(q, {_GROWTH + i: 100.0})
+        found |= _principal(q, covariance)
     return found

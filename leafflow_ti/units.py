@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from leafflow_ti.aim import Aim
 from leafflow_ti.capture import Capture
 from leafflow_ti.engines import Engine, keep
-from leafflow_ti.field import empty_map
+from leafflow_ti.field import CORRELATIONS, coarsened, empty_map
 from leafflow_ti.growth import growth_maps
 from leafflow_ti.identify import settle
 from leafflow_ti.plan import Plan
@@ -135,7 +135,8 @@ class Units:
         plan, (y, x) = self.plan, self.around(index)
         unit = plan.y[plan.band(index)]
         inner = slice(y.index(unit[0]), y.index(unit[-1]) + 1), slice(x.index(plan.x[0]), x.index(plan.x[-1]) + 1)
-        return {n: maps[n][inner].copy() for n in plan.names}, codes[inner].copy()
+        cut = {n: maps[n][inner].copy() for n in plan.names}
+        return {n: coarsened(m) if n in CORRELATIONS else m for n, m in cut.items()}, codes[inner].copy()
 
 
 def _widened(positions: range, size: int, margin: int) -> range:

@@ -11,6 +11,7 @@ import pytest
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import load_config, resolve
 from leafflow_ti.errors import ConfigError
+from leafflow_ti.field import PRINCIPAL_NAMES
 from leafflow_ti.plan import Plan, make_plan
 from leafflow_ti.refine_plan import Refinement, plan_refinement
 from leafflow_ti.splines import filter_radius
@@ -145,7 +146,9 @@ def test_one_camera_sees_a_flat_patch(
     assert found is not None
     assert (found.flat, found.cameras, found.estimated) == (True, ((0, 0),), estimated)
     wanted = {n for n in ("flow_x", "flow_y", *GRADIENT, *STRAIN) if n not in without}
-    assert set(found.names) == wanted
+    axes = set(PRINCIPAL_NAMES) if found.modes == 3 else set()
+    assert set(found.names) == wanted | axes
+    assert axes <= set(planned.quantities)
     assert {n for n in planned.quantities if n.startswith(("flow", "strain"))} == wanted
     assert f"{len(estimated)} unknowns (flow" in planned.describe()
 

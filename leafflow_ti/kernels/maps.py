@@ -50,7 +50,10 @@ class Output(IntEnum):
     STATUS = 64
     CONFIDENCE = 65
     SUPPORT = 66
-    PLANES = 67
+    VELOCITY_CORRELATION_XY = 67
+    VELOCITY_CORRELATION_XZ = 68
+    VELOCITY_CORRELATION_YZ = 69
+    PLANES = 70
 
 
 EXPECTED = 10.0
@@ -304,6 +307,17 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
             world(p, number, value, ws)
 
     @ti.func
+    def correlation(r: ti.i32, c: ti.i32, p: ti.template(), number: ti.template(), ws: ti.template()):
+        """Correlation of the errors of two components r > c of the velocity, where both are unknowns."""
+        n, cov = number[p.n + Number.UNKNOWNS], region(p, number, Region.MOTION_COV)
+        one, two = number[p.n + Number.PLACE + r], number[p.n + Number.PLACE + c]
+        if one >= 0 and two >= 0:
+            both = ws[cov + one * (n + 1) * p.stride] * ws[cov + two * (n + 1) * p.stride]
+            found = ws[cov + (one * n + two) * p.stride] / ti.sqrt(both)
+            plane = Output.VELOCITY_CORRELATION_XY + r * (r - 1) // 2 + c
+            ws[region(p, number, Region.OUT) + plane * p.stride] = ti.max(ti.min(found, V(1.0)), V(0.0 - 1.0))
+
+    @ti.func
     def motion(
         p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template(), J: ti.template(),
         out: ti.template(),
@@ -319,6 +333,9 @@ def maps_stages(spec: KernelSpec) -> SimpleNamespace:
                 determined = (variance > V(0.0)) & (variance < V(1e30))
                 found = ti.select(determined, ws[region(p, number, Region.MOTION) + j * p.stride], V(nan))
                 put(Output.MOTION + j, found, variance, p, target, ws)
+        for r in range(1, 3):
+            for c in range(r):
+                correlation(r, c, p, number, ws)
         if n >= 3:
             for axis in range(2):
                 for r in range(3):

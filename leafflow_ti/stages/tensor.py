@@ -28,7 +28,7 @@ from leafflow_ti.stages.windows import Windows, taps
 from leafflow_ti.trace import span
 
 __all__ = ["EXTRA_PLANES", "FACTOR_PLANES", "OUTPUT_PLANES", "Band", "Request", "TensorStage", "band_bytes"]
-OUTPUT_PLANES = 67
+OUTPUT_PLANES = 70
 _WEIGHT = 7
 """Place of the linear terms' weights among the tables of the filters."""
 TASKS = 32
