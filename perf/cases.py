@@ -65,6 +65,7 @@ CASES = (
     Case("estimators-edges", "estimators.edges:run", "the cube within 20 px of its edges, plain and robust"),
     Case("estimators-coverage", "estimators.coverage:run", "whether error bars are true, by estimator and noise"),
     Case("speckle", "speckle:run", "one camera as a strain gauge: rendered plate, rigid series, noise floor by window"),
+    Case("strain-peers", "strain_peers:run", "strain from three images, beside muDIC and pyvale on the same ones"),
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
     Case("plan-rig", "plan_rig:run", "errors predicted for a camera rig against the scatter of simulated estimates"),
     Case("rig-check", "rig_check:run", "a camera 10 µm off its place: found by check, depth without and with its line"),

@@ -115,27 +115,33 @@ DENSITY = 0.2
 
 
 @cache
-def speckle_image(shift: float, seed: int = 0) -> Array:
-    """Grey values [SIDE, SIDE] of a specimen that has moved along x by ``shift`` px; float64, without noise.
+def speckle_image(
+    shift: float, seed: int = 0, shape: tuple[int, int] = (SIDE, SIDE), strain: tuple[float, float] = (0.0, 0.0)
+) -> Array:
+    """Grey values [``shape``] of a specimen that has moved along x by ``shift`` px and has been stretched along x and y
+    about the middle of the image by ``strain``; float64, without noise.
 
     Each pixel is the mean over its area.
     """
     rng, margin = np.random.default_rng(seed), 10
-    n = int(DENSITY * (SIDE + 2 * margin) ** 2)
-    x, y = rng.uniform(-margin, SIDE + margin, (2, n))
+    size = np.array(shape[::-1])
+    n = int(DENSITY * np.prod(size + 2 * margin))
+    places = rng.uniform(-margin, size[:, None] + margin, (2, n))
     radius, sign = rng.uniform(1.0, 2.0, n), rng.choice([-1.0, 1.0], n)
-    edges = np.arange(SIDE * SUPERSAMPLING + 1) / SUPERSAMPLING - 0.5
 
-    def along(centres: Array) -> Array:
+    def along(axis: int, moved: float) -> Array:
         """Means of the Gaussians over the parts of pixels, [parts, n]."""
-        steps = np.diff(erf((edges[:, None] - centres) / (np.sqrt(2) * radius)), axis=0)
-        return steps * radius * (np.sqrt(np.pi / 2) * SUPERSAMPLING)
+        edges = np.arange(size[axis] * SUPERSAMPLING + 1) / SUPERSAMPLING - 0.5
+        centres = places[axis] + strain[axis] * (places[axis] - (size[axis] - 1) / 2) + moved
+        width = radius * (1 + strain[axis])
+        steps = np.diff(erf((edges[:, None] - centres) / (np.sqrt(2) * width)), axis=0)
+        return steps * width * (np.sqrt(np.pi / 2) * SUPERSAMPLING)
 
-    field = (along(y) * sign) @ along(x + shift).T
+    field = (along(1, 0.0) * sign) @ along(0, shift).T
     # The variance of such a sum is known (Campbell): the same for every shift.
     field /= np.sqrt(DENSITY * np.pi * np.mean(radius**2))
     grey = GREYS * (0.5 + 0.4 * np.tanh(field))
-    return grey.reshape(SIDE, SUPERSAMPLING, SIDE, SUPERSAMPLING).mean(axis=(1, 3))
+    return grey.reshape(shape[0], SUPERSAMPLING, shape[1], SUPERSAMPLING).mean(axis=(1, 3))
 
 
 def three_images(step: float, noise: float, seed: int) -> ArrayCapture:

@@ -1,11 +1,10 @@
-"""Captures: every naming and stacking of the same images reads alike; windows, preshift, cache, refusals."""
+"""Captures: every naming and stacking of the same images reads alike; windows, preshift, refusals."""
 
 from __future__ import annotations
 
 import itertools
 import os
 import shutil
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 import tifffile
 
 from leafflow_ti.capture import Capture, Geometry, capture_from_array, open_capture
-from leafflow_ti.capture.cache import ImageCache
 from leafflow_ti.errors import ConfigError, InputError
 
 DATA = Path(os.environ.get("LEAFFLOW_TI_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -22,14 +20,14 @@ IMAGES = RNG.integers(0, 4096, (3, 2, 4, 20, 24), np.uint16)  # t, sy, sx, y, x
 GRID = "[camera]\nfocal_length_px = 1000.0\n[grid]\nbaseline_mm = [5.0, 4.0]\n"
 
 
-def _write_files(folder: Path, images: np.ndarray = IMAGES, first: int = 0, **options: object) -> None:
+def write_files(folder: Path, images: np.ndarray = IMAGES, first: int = 0, **options: object) -> None:
     for t, sy, sx in np.ndindex(images.shape[:3]):
         name = folder / f"row{sy + first}" / f"c{sx + first:02d}_{t + first:03d}.tif"
         name.parent.mkdir(exist_ok=True)
         tifffile.imwrite(name, images[t, sy, sx], **options)
 
 
-def _describe(folder: Path, images: str, rest: str = GRID) -> Path:
+def describe(folder: Path, images: str, rest: str = GRID) -> Path:
     path = folder / "capture.toml"
     path.write_text(f"[images]\n{images}\n{rest}", encoding="utf-8")
     return path
@@ -40,8 +38,8 @@ FILES = 'pattern = "row{sy}/c{sx:02d}_{t:03d}.tif"'
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    _write_files(tmp_path)
-    _describe(tmp_path, FILES)
+    write_files(tmp_path)
+    describe(tmp_path, FILES)
     return tmp_path
 
 
@@ -67,7 +65,7 @@ def test_one_file_per_image(folder: Path) -> None:
 def test_indices_may_start_anywhere_and_step(tmp_path: Path) -> None:
     for sx, t in itertools.product((1, 2), (10, 14, 18)):
         tifffile.imwrite(tmp_path / f"{sx}_{t}.tif", np.full((16, 16), 100 * sx + t, np.uint16))
-    _describe(tmp_path, 'pattern = "{sx}_{t}.tif"', "[camera]\nfocal_length_px = 9\n[grid]\nbaseline_mm = -3\n")
+    describe(tmp_path, 'pattern = "{sx}_{t}.tif"', "[camera]\nfocal_length_px = 9\n[grid]\nbaseline_mm = -3\n")
     capture = open_capture(tmp_path)
     assert capture.frames == (10, 14, 18)
     assert capture.geometry is not None
@@ -85,14 +83,14 @@ def test_one_stack_in_any_order_of_axes(tmp_path: Path, axes: str, sizes: str) -
         stack = stack.reshape(-1, *stack.shape[3:])
         shape = "\nshape = { t = 3, sy = 2, sx = 4 }"
     tifffile.imwrite(tmp_path / "stack.tif", stack, photometric="minisblack")
-    _describe(tmp_path, f'path = "stack.tif"\naxes = "{axes} y x"{shape}')
+    describe(tmp_path, f'path = "stack.tif"\naxes = "{axes} y x"{shape}')
     np.testing.assert_array_equal(_whole(open_capture(tmp_path)), IMAGES)
 
 
 def test_one_stack_per_camera(tmp_path: Path) -> None:
     for sy, sx in np.ndindex(2, 4):
         tifffile.imwrite(tmp_path / f"{sy}-{sx}.tif", IMAGES[:, sy, sx], photometric="minisblack")
-    _describe(tmp_path, 'pattern = "{sy}-{sx}.tif"\naxes = "t y x"')
+    describe(tmp_path, 'pattern = "{sy}-{sx}.tif"\naxes = "t y x"')
     np.testing.assert_array_equal(_whole(open_capture(tmp_path)), IMAGES)
 
 
@@ -100,7 +98,7 @@ def test_one_stack_per_camera(tmp_path: Path) -> None:
 def test_a_running_index(tmp_path: Path, first: int) -> None:
     for index, image in enumerate(IMAGES.reshape(-1, 20, 24)):
         tifffile.imwrite(tmp_path / f"{index + first:04d}.tif", image)
-    _describe(tmp_path, 'pattern = "{i:04d}.tif"\norder = "t sy sx"\nshape = { t = 3, sy = 2, sx = 4 }')
+    describe(tmp_path, 'pattern = "{i:04d}.tif"\norder = "t sy sx"\nshape = { t = 3, sy = 2, sx = 4 }')
     np.testing.assert_array_equal(_whole(open_capture(tmp_path)), IMAGES)
     (tmp_path / f"{5 + first:04d}.tif").unlink()
     with pytest.raises(InputError, match=rf"1 of 24 images are missing: .*{5 + first:04d}\.tif"):
@@ -110,17 +108,17 @@ def test_a_running_index(tmp_path: Path, first: int) -> None:
 def test_a_running_index_beyond_the_shape(tmp_path: Path) -> None:
     for index in range(5):
         tifffile.imwrite(tmp_path / f"{index}.tif", IMAGES[0, 0, 0])
-    _describe(tmp_path, 'pattern = "{i}.tif"\norder = "sx"\nshape = { sx = 4 }', GRID)
+    describe(tmp_path, 'pattern = "{i}.tif"\norder = "sx"\nshape = { sx = 4 }', GRID)
     with pytest.raises(InputError, match=r"4\.tif: image 5 of a shape with 4"):
         open_capture(tmp_path)
 
 
 def test_select_leaves_the_rest_out(folder: Path) -> None:
-    _describe(folder, FILES + "\nselect = { t = [0, 2, 2], sx = [1, 3] }")
+    describe(folder, FILES + "\nselect = { t = [0, 2, 2], sx = [1, 3] }")
     capture = open_capture(folder)
     assert capture.frames == (0, 2)
     np.testing.assert_array_equal(_whole(capture), IMAGES[::2, :, 1:4])
-    _describe(folder, FILES + "\nselect = { t = [0, 3] }")
+    describe(folder, FILES + "\nselect = { t = [0, 3] }")
     with pytest.raises(InputError, match=r"8 of 32 images are missing: .*c00_003\.tif.* and 4 more"):
         open_capture(folder)
 
@@ -184,90 +182,6 @@ def test_arrays_that_are_no_capture(images: np.ndarray, message: str) -> None:
         capture_from_array(images)
 
 
-@pytest.mark.parametrize("options", [{}, {"tile": (16, 16)}, {"compression": "zlib"}])
-def test_bounded_cache_gives_the_same_values_from_several_threads(tmp_path: Path, options: dict[str, object]) -> None:
-    _write_files(tmp_path, **options)
-    _describe(tmp_path, FILES)
-    capture = open_capture(tmp_path, cache_bytes=5 * IMAGES[0, 0, 0].nbytes)
-    failures: list[str] = []
-
-    def reader(seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        for t, sy, sx in rng.integers(0, IMAGES.shape[:3], (60, 3)):
-            if not np.array_equal(capture.read(t, sy, sx, 2, 15, 3, 20), IMAGES[t, sy, sx, 2:15, 3:20]):
-                failures.append(f"{t} {sy} {sx}")
-
-    threads = [threading.Thread(target=reader, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failures == []
-    if "compression" in options:
-        assert 0 < capture._cache.used <= capture._cache.limit
-    else:
-        assert capture._cache.used == 0  # windows are read as such
-
-
-def test_cache_forgets_the_least_recently_used() -> None:
-    cache, loads = ImageCache(limit=20), []
-
-    def load(key: str, size: int = 8) -> np.ndarray:
-        def fresh() -> np.ndarray:
-            loads.append(key)
-            return np.zeros(size, np.uint8)
-
-        return cache.get(key, fresh)
-
-    for key in "abacab":  # c drives b out, as a was used later
-        load(key)
-    assert "".join(loads) == "abcb"
-    assert cache.used == 16
-    load("huge", 21)
-    assert cache.used == 16
-    with pytest.raises(ValueError, match="read-only"):
-        load("a")[0] = 1
-
-
-def test_cache_with_a_lower_limit_forgets_at_once() -> None:
-    cache = ImageCache(limit=20)
-    for key in "ab":
-        cache.get(key, lambda: np.zeros(8, np.uint8))
-    cache.set_limit(15)
-    assert cache.used == 8
-    assert cache.get("b", lambda: np.ones(8, np.uint8)).sum() == 0  # the older one went
-    cache.set_limit(0)
-    assert cache.get("c", lambda: np.ones(8, np.uint8)).sum() == 8
-    assert cache.used == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "worth"), [({}, 0), ({"compression": "zlib", "rowsperstrip": 5}, 0), ({"compression": "zlib"}, 1)]
-)
-def test_only_images_that_are_decoded_whole_are_worth_keeping(
-    tmp_path: Path, options: dict[str, object], worth: int
-) -> None:
-    _write_files(tmp_path, **options)
-    _describe(tmp_path, FILES)
-    capture = open_capture(tmp_path)
-    assert capture.cacheable_bytes == worth * IMAGES.nbytes
-    capture.block(range(3), range(2), range(4), 2, 15, 3, 20)
-    assert capture._cache.used == worth * IMAGES.nbytes
-    capture.keep_decoded(0)
-    assert capture._cache.used == 0
-
-
-def test_a_failed_load_can_be_tried_again() -> None:
-    cache = ImageCache(limit=20)
-
-    def fail() -> np.ndarray:
-        raise InputError("damaged")
-
-    with pytest.raises(InputError, match="damaged"):
-        cache.get("a", fail)
-    assert cache.get("a", lambda: np.ones(2, np.uint8)).sum() == 2
-
-
 def test_frames_with_stamps_may_have_gaps_in_their_numbers(tmp_path: Path) -> None:
     """Each has a time of its own; without stamps the numbers are the times, and images are missing."""
     numbers = (0, 4, 8, 10)
@@ -296,7 +210,7 @@ def test_missing_images_are_named(folder: Path) -> None:
 
 def test_doubled_images_are_named(folder: Path) -> None:
     shutil.copy(folder / "row0/c00_000.tif", folder / "row0/c00_0.tif")
-    _describe(folder, 'pattern = "row{sy}/c{sx:02d}_{t}.tif"')
+    describe(folder, 'pattern = "row{sy}/c{sx:02d}_{t}.tif"')
     with pytest.raises(InputError, match=r"two files for one image: .*c00_0\.tif and .*c00_000\.tif"):
         open_capture(folder)
 
@@ -328,10 +242,10 @@ def test_unreadable_images_are_named(folder: Path) -> None:
 def test_nothing_found_and_no_description(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"capture\.toml: cannot be read"):
         open_capture(tmp_path)
-    _describe(tmp_path, FILES)
+    describe(tmp_path, FILES)
     with pytest.raises(InputError, match=r"no file fits .*row\{sy\}"):
         open_capture(tmp_path)
-    _describe(tmp_path, 'path = "none.tif"', "")
+    describe(tmp_path, 'path = "none.tif"', "")
     with pytest.raises(InputError, match=r"none\.tif: cannot be read"):
         open_capture(tmp_path)
 
@@ -343,13 +257,13 @@ def test_pages_and_axes_must_fit(tmp_path: Path) -> None:
         ('path = "a.tif"\naxes = "t y x"\nshape = { t = 4 }', "3 pages, the description asks for t 4"),
         ('path = "a.tif"\naxes = "t sx y x"', r"3 pages for the axes t sx: state their sizes"),
     ]:
-        _describe(tmp_path, images)
+        describe(tmp_path, images)
         with pytest.raises(InputError, match=message):
             open_capture(tmp_path)
     with tifffile.TiffWriter(tmp_path / "a.tif") as writer:
         writer.write(IMAGES[0, 0, 0], metadata=None)
         writer.write(IMAGES[0, 0, 0, :10], metadata=None)
-    _describe(tmp_path, 'path = "a.tif"\naxes = "t y x"')
+    describe(tmp_path, 'path = "a.tif"\naxes = "t y x"')
     with pytest.raises(InputError, match=r"a\.tif: pages differ \(page 1 is 10 x 24"):
         open_capture(tmp_path)
 
@@ -368,38 +282,36 @@ def test_pages_and_axes_must_fit(tmp_path: Path) -> None:
     ],
 )
 def test_a_grid_needs_its_geometry(folder: Path, rest: str, message: str) -> None:
-    _describe(folder, FILES, rest)
+    describe(folder, FILES, rest)
     with pytest.raises(ConfigError, match=message):
         open_capture(folder)
 
 
 def test_grid_along_y_and_single_camera(folder: Path) -> None:
-    _describe(
-        folder, 'pattern = "row{sy}/c01_{t:03d}.tif"', GRID.replace("[5.0, 4.0]", "4.0\ndisparity_offset_px = -2")
-    )
+    describe(folder, 'pattern = "row{sy}/c01_{t:03d}.tif"', GRID.replace("[5.0, 4.0]", "4.0\ndisparity_offset_px = -2"))
     capture = open_capture(folder)
     assert capture.shape == (3, 2, 1, 20, 24)
     assert capture.geometry == Geometry(1000.0, (11.5, 9.5), (0.0, 4.0), (0.0, -2.0))
     np.testing.assert_array_equal(_whole(capture), IMAGES[:, :, 1:2])
-    _describe(folder, 'pattern = "row1/c03_{t:03d}.tif"', "[time]\ninterval_s = 60.0\n")
+    describe(folder, 'pattern = "row1/c03_{t:03d}.tif"', "[time]\ninterval_s = 60.0\n")
     single = open_capture(folder)
     assert (single.geometry, single.frame_interval_s, single.reference) == (None, 60.0, (0, 0))
     np.testing.assert_array_equal(_whole(single), IMAGES[:, 1:, 3:])
-    _describe(folder, 'path = "row1/c03_002.tif"', "[camera]\nfocal_length_px = 9\nprincipal_point_px = [1, 2]\n")
+    describe(folder, 'path = "row1/c03_002.tif"', "[camera]\nfocal_length_px = 9\nprincipal_point_px = [1, 2]\n")
     calibrated = open_capture(folder)
     assert calibrated.geometry == Geometry(9.0, (1.0, 2.0), (0.0, 0.0), (0.0, 0.0))
     assert calibrated.frames == (0,)
 
 
 def test_stated_bit_depth_must_hold(folder: Path) -> None:
-    _describe(folder, FILES + "\nbit_depth = 12")
+    describe(folder, FILES + "\nbit_depth = 12")
     capture = open_capture(folder)
     assert capture.bits == 12
     np.testing.assert_array_equal(_whole(capture), IMAGES)
-    _describe(folder, FILES + "\nbit_depth = 11")
+    describe(folder, FILES + "\nbit_depth = 11")
     with pytest.raises(InputError, match=r"\.tif: grey value \d+ does not fit bit_depth = 11"):
         _whole(open_capture(folder))
-    _describe(folder, FILES + "\nbit_depth = 17")
+    describe(folder, FILES + "\nbit_depth = 17")
     with pytest.raises(InputError, match="bit_depth = 17 does not fit"):
         open_capture(folder)
 
@@ -408,9 +320,9 @@ def test_colour_by_the_stated_channel(tmp_path: Path) -> None:
     rgb = RNG.integers(0, 255, (12, 16, 3), np.uint8)
     tifffile.imwrite(tmp_path / "a.tif", rgb, photometric="rgb")
     for channel, expected in [('"red"', rgb[..., 0]), ("1", rgb[..., 1]), ('"mean"', rgb.mean(axis=-1))]:
-        _describe(tmp_path, f'path = "a.tif"\nchannel = {channel}', "")
+        describe(tmp_path, f'path = "a.tif"\nchannel = {channel}', "")
         np.testing.assert_allclose(open_capture(tmp_path).read(0, 0, 0, 0, 12, 0, 16), expected, rtol=1e-6)
-    _describe(tmp_path, 'path = "a.tif"\nchannel = 3', "")
+    describe(tmp_path, 'path = "a.tif"\nchannel = 3', "")
     with pytest.raises(InputError, match="no channel 3"):
         open_capture(tmp_path)
 
@@ -429,7 +341,7 @@ def test_the_real_light_field_opens(tmp_path: Path) -> None:
     source = DATA / "hci_cotton"
     if not source.is_dir():
         pytest.skip(f"no light field in {source}")
-    _describe(
+    describe(
         tmp_path,
         f'pattern = "{source.as_posix()}/input_Cam{{i:03d}}.png"\norder = "sy sx"\nshape = {{ sy = 9, sx = 9 }}',
         "[camera]\nfocal_length_px = 1462.86\n[grid]\nbaseline_mm = [25, 25]\ndisparity_offset_px = [-8.605, -8.605]\n",

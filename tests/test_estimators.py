@@ -6,10 +6,10 @@ import functools
 from collections.abc import Callable
 from dataclasses import replace
 
-import conftest
+import estimate_bench
 import numpy as np
 import pytest
-from conftest import Bench, Estimated
+from estimate_bench import Bench, Estimated
 from reference import estimators as twin
 from reference import patch
 from reference.estimators import PENALTIES
@@ -167,10 +167,10 @@ def test_cells_of_blocks(make_bench: Callable, estimator: str, size: int, stride
 @pytest.mark.parametrize("estimator", WEIGHTED)
 def test_cells_of_blocks_with_cameras(make_bench: Callable, estimator: str) -> None:
     pixel = AxisSampling.gaussian(filter_set("5"), 37, 11.0, 4)
-    sampling = replace(conftest.sampling_of("line-x", True), x=pixel, y=pixel)
+    sampling = replace(estimate_bench.sampling_of("line-x", True), x=pixel, y=pixel)
     columns = column_set(MODELS["affine-4d"], "none", sampling.camera_axes, sampling.sampled)
     band = Band.of(sampling, 3, 5, 4)
-    images = conftest.rendered(conftest.SCENE, "line-x", (band.in_cols, band.in_rows))
+    images = estimate_bench.rendered(estimate_bench.SCENE, "line-x", (band.in_cols, band.in_rows))
     b = make_bench(images, sampling, columns, "f64", (3, 5), 4)
     assert_parameters_equal(b, b.estimate(estimator=estimator, robust="all", noise=1.0, solver="jacobi"))
 

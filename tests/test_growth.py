@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import sampling_of
+from estimate_bench import sampling_of
 from reference import growth as twin
 from test_kernels_accuracy import NOISE, OPTIONS, SINUSOID, capture_of
 from test_pipeline import OPTIONS as SMALL_OPTIONS

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import OWN_FLOW_CASES
+from estimate_bench import OWN_FLOW_CASES
 from reference import chain, patch
 from tolerances import SOLVERS, tolerance
 

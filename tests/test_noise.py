@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import replace
 
-import conftest
+import estimate_bench
 import numpy as np
 import pytest
 from reference import chain
@@ -19,7 +19,7 @@ from leafflow_ti.stages.thresholds import DENOISE
 from leafflow_ti.status import Status
 
 SCENE = replace(
-    conftest.SCENE,
+    estimate_bench.SCENE,
     noise=2.0,
     velocity=(0.01, -0.007, 0.0),
     omega=(0.0, 0.0, 0.0),
@@ -40,14 +40,14 @@ def estimates(
     make_bench: Callable, model: str, estimator: str, light: tuple[str, str] = ("none", "none")
 ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
     """Over seeds and places: parameters [n, places, m], predicted standard deviations likewise, noise variances."""
-    sampling = conftest.sampling_of("line-x", True)
+    sampling = estimate_bench.sampling_of("line-x", True)
     columns = column_set(MODELS[model], light[0], sampling.camera_axes, sampling.sampled, light[1])
     names = [f"{axis}: {c.channel}{c.offset}" for axis in columns.solutions for c in columns.columns[: columns.n_flow]]
     halo = sampling.x.radius + sampling.x.filter_radius
     size = (DISTANCE + 1 + 2 * halo, DISTANCE + 1 + 2 * halo)
     found, predicted, variances = [], [], []
     for seed in range(SEEDS):
-        images = conftest.rendered(replace(SCENE, seed=seed), "line-x", size)
+        images = estimate_bench.rendered(replace(SCENE, seed=seed), "line-x", size)
         bench = make_bench(images, sampling, columns, "f32", (2, 2), DISTANCE)
         result = bench.estimate(estimator=estimator)
         assert (result.status == Status.OK).all()

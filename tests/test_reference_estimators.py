@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 
-import conftest
+import estimate_bench
 import numpy as np
 import pytest
 from reference import chain, estimators
@@ -58,9 +58,9 @@ def boundary_cells(model: str = "flow-affine") -> Cells:
 
 
 def camera_cells(exact: bool = False) -> Cells:
-    sampling = conftest.sampling_of("line-x", True)
+    sampling = estimate_bench.sampling_of("line-x", True)
     side = 2 * sampling.x.radius + 1
-    images = conftest.rendered(replace(conftest.SCENE, noise=3.0), "line-x", (side, side))
+    images = estimate_bench.rendered(replace(estimate_bench.SCENE, noise=3.0), "line-x", (side, side))
     return Cells.at(images, sampling, columns_of("affine-4d", sampling), (side // 2, side // 2), exact=exact)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import conftest
+import estimate_bench
 import numpy as np
 import pytest
 from reference import patch
@@ -137,11 +137,11 @@ TIMES = (0.0, 1.0, 2.1, 3.0, 3.95, 5.0, 6.1)
      ("flow-affine", "temporal", "single", "tls-equilibrated")],
 )  # fmt: skip
 def test_stages_agree_with_the_twin(
-    bench: Callable[..., conftest.Bench], model: str, brightness: str, grid: str, estimator: str
+    bench: Callable[..., estimate_bench.Bench], model: str, brightness: str, grid: str, estimator: str
 ) -> None:
     """Images of even cameras and frames taken for uneven ones: tensors, maps and error bars against direct sums."""
     even = bench(model, brightness, grid, "f64")
-    rows, cols = conftest.GRIDS[grid]
+    rows, cols = estimate_bench.GRIDS[grid]
     x, y = (np.array(off_by(rows, cols, 1.0, 50))[..., k] for k in (0, 1))
     s = even.sampling
     assert s.t.filters is not None
@@ -174,7 +174,7 @@ def test_stages_agree_with_the_twin(
 @pytest.mark.parametrize(("taps", "size"), [("2", 1), ("2", 3), ("4", 3)])
 @pytest.mark.parametrize("irregular", [False, True])
 def test_results_between_frames_agree_with_the_twin(
-    bench: Callable[..., conftest.Bench], taps: str, size: int, irregular: bool
+    bench: Callable[..., estimate_bench.Bench], taps: str, size: int, irregular: bool
 ) -> None:
     """An even number of taps along time: there are more frames behind the reference frame than before it."""
     even = bench("affine-4d", "none", "line-x", "f64")
