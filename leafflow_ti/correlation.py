@@ -21,10 +21,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from leafflow_ti.errors import InputError
-from leafflow_ti.field import CORRELATIONS, MOTION_NAMES
+from leafflow_ti.field import CORRELATIONS, MOTION_NAMES, Field
 from leafflow_ti.plan import Plan
 from leafflow_ti.refine_plan import Refinement
 from leafflow_ti.results import ResultStore
@@ -57,8 +57,8 @@ class NoiseCorrelation:
     stated: bool = True
 
     @classmethod
-    def of(cls, store: ResultStore) -> NoiseCorrelation:
-        """Of a results store."""
+    def of(cls, store: ResultStore | Field) -> NoiseCorrelation:
+        """Of the results of a run, or of one frame of them."""
         plan: Mapping[str, Any] = store.attrs.get("plan", {})
         if KEY not in plan:
             side = int(tomllib.loads(store.attrs["config"])["window"]["size"])
@@ -69,12 +69,14 @@ class NoiseCorrelation:
             _at_pitch(found["x"], _pitch(store.x)), _at_pitch(found["y"], _pitch(store.y)), found.get("t", np.ones(1))
         )
 
-    def between(self, axis: str, n: int) -> Array:
-        """Correlation matrix [n, n] of so many consecutive output columns "x", rows "y" or frames "t"."""
-        first = np.zeros(n)
-        stated = getattr(self, axis)[:n]
+    def between(self, axis: str, places: ArrayLike) -> Array:
+        """Correlation matrix [n, n] of errors at these output columns "x", rows "y" or frames "t"; a number n: at as
+        many that follow each other."""
+        at = np.arange(places) if isinstance(places, int) else np.asarray(places, int)
+        distance = np.abs(np.subtract.outer(at, at))
+        stated = getattr(self, axis)
+        first = np.zeros(max(int(distance.max(initial=0)) + 1, stated.size))
         first[: stated.size] = stated
-        distance = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
         return np.asarray(first[distance])
 
 
@@ -104,12 +106,17 @@ def velocity_covariance(maps: Mapping[str, NDArray[Any]]) -> Array:
 
 
 def stated_correlation(plan: Plan) -> dict[str, list[float]]:
-    """What a run states: R at 0, 1, 2, ... px along x and y and, where there is motion, frames along t."""
+    """What a run states: R at 0, 1, 2, ... px along x and y and, where there is motion, frames along t.
+
+    ``x_gradient``, ``y_gradient``: the same of what a window tells of derivatives along x and y, as slopes and growth.
+    """
     refine, sampling = plan.refine, plan.problem.sampling
     if refine is not None:
         found = {axis: _refined_window(refine) for axis in "xy"}
+        found |= {f"{axis}_gradient": _refined_window(refine, 1) for axis in "xy"}
     else:
         found = {axis: _window(sampling.axis(axis)) for axis in "xy"}
+        found |= {f"{axis}_gradient": _window(sampling.axis(axis), 1) for axis in "xy"}
     if refine is not None and refine.motion:
         found["t"] = _autocorrelation(slope_weights(refine.frames, refine.motion > 6))
     elif sampling.t.filters is not None:
@@ -129,17 +136,17 @@ def _autocorrelation(weights: Array) -> Array:
     return np.asarray(found / found[0])
 
 
-def _window(axis: AxisSampling) -> Array:
-    """Of the model's windows, at 0, 1, 2, ... px."""
-    return _autocorrelation(np.convolve(axis.window(0), axis.kernel(False)))
+def _window(axis: AxisSampling, power: int = 0) -> Array:
+    """Of the model's windows, at 0, 1, 2, ... px; ``power`` 1: of gradients within them."""
+    return _autocorrelation(np.convolve(axis.window(power), axis.kernel(False)))
 
 
-def _refined_window(refine: Refinement) -> Array:
-    """Of the refinement's windows, at 0, 1, 2, ... px."""
+def _refined_window(refine: Refinement, power: int = 0) -> Array:
+    """Of the refinement's windows, at 0, 1, 2, ... px; ``power`` 1: of gradients within them."""
     half = refine.across // 2
     offsets = refine.thin * np.arange(-half, half + 1)
     weights = np.zeros(2 * refine.thin * half + 1)
-    weights[offsets + refine.thin * half] = np.exp(-0.5 * (offsets / refine.sigma) ** 2)
+    weights[offsets + refine.thin * half] = offsets**power * np.exp(-0.5 * (offsets / refine.sigma) ** 2)
     one_side = interpolated_noise(1, refine.degree)
     noise = np.concatenate([one_side[:0:-1], one_side])
     shared = np.convolve(np.correlate(weights, weights, "full"), noise)[weights.size + one_side.size - 2 :]

@@ -54,7 +54,7 @@ def surface_mesh(field: Field, jump: float = JUMP) -> SurfaceMesh:
     pixels = np.flatnonzero(known)
     number = np.full(known.size, -1, np.int32)
     number[pixels] = np.arange(pixels.size, dtype=np.int32)
-    triangles = _triangles(_Neighbours(points, slopes, jump), number.reshape(known.shape))
+    triangles = _triangles(Neighbours(points, slopes, jump), number.reshape(known.shape))
     vertices = points.reshape(-1, 3)[pixels]
     normals = _normals(vertices, triangles)
     if slopes is not None:
@@ -100,10 +100,13 @@ def _slopes(field: Field) -> tuple[Floats, Floats] | None:
     return field["slope_x"].astype(np.float64), field["slope_y"].astype(np.float64)
 
 
-class _Neighbours:
-    """Which pixels lie on one surface with a neighbour, and how far the depths of the two differ."""
+class Neighbours:
+    """Which pixels lie on one surface with a neighbour.
 
-    def __init__(self, points: Floats, slopes: tuple[Floats, Floats] | None, jump: float):
+    ``points`` [y, x, 3]: positions, NaN where there is none; ``slopes``: dZ/dX, dZ/dY [y, x]; ``jump``: see ``JUMP``.
+    """
+
+    def __init__(self, points: Floats, slopes: tuple[Floats, Floats] | None, jump: float = JUMP):
         self.depth = points[..., 2]
         self._jump = jump
         with np.errstate(invalid="ignore"):
@@ -136,7 +139,7 @@ class _Neighbours:
             return np.asarray(self.depth[source] * below(source) / below(target))
 
 
-def _triangles(neighbours: _Neighbours, number: NDArray[np.int32]) -> NDArray[np.int32]:
+def _triangles(neighbours: Neighbours, number: NDArray[np.int32]) -> NDArray[np.int32]:
     """Triangles [m, 3] of the squares of four neighbouring pixels ``a b / c d``, two, one or none in each.
 
     ``number`` [y, x]: vertex of each pixel. A square is cut along the diagonal that gives more triangles, then along

@@ -134,8 +134,6 @@ class Plan:
             names += ["slope_x", "slope_y"]
         names += self.ranges.quantities if self.ranges else ()
         names += MOTION_NAMES[: problem.unknowns]
-        if problem.unknowns > 1:
-            names += CORRELATIONS[:1] if problem.unknowns == 2 else CORRELATIONS
         if "t" in problem.columns.solutions and not self.ranges:
             names += ["flow_x", "flow_y", "normal_flow_x", "normal_flow_y"]
             if not problem.unknowns and len(problem.offsets) > 1:
@@ -146,6 +144,8 @@ class Plan:
         names += [WORLD_MAPS[o] for o in problem.world_brightness]
         if "depth" in names and problem.unknowns >= 3:
             names.append("growth_rate")
+        if problem.unknowns >= 2:
+            names += CORRELATIONS if problem.unknowns >= 3 else CORRELATIONS[:1]
         names.append("confidence")
         names += ["support"] if ESTIMATORS[problem.estimator].robust else []
         return (*names, "identified")

@@ -43,13 +43,13 @@ _COMPRESSOR = ZstdCodec(level=0, checksum=False)
 _METADATA = "zarr.json"
 """The group's metadata file, attributes included (Zarr v3)."""
 
-_COORDINATES: dict[str, dict[str, Any]] = {
+COORDINATES: dict[str, dict[str, Any]] = {
     "t": {"long_name": "index of the reference frame", "units": "frame"},
     "y": {"long_name": "row in the reference image, downwards", "units": "px"},
     "x": {"long_name": "column in the reference image, to the right", "units": "px"},
 }
 
-_TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
+TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -104,7 +104,7 @@ class ResultStore:
                 group = zarr.create_group(scratch, zarr_format=3)
                 group.update_attributes({"Conventions": "CF-1.11", **attrs, "leafflow_ti_format": FORMAT})
                 for axis, values in coordinates.items():
-                    attributes = dict(_COORDINATES[axis])
+                    attributes = dict(COORDINATES[axis])
                     if axis == "t" and interval_s is not None:
                         attributes["interval_s"] = float(interval_s)
                     if axis == "t" and time_offset:
@@ -112,7 +112,7 @@ class ResultStore:
                     group.create_array(axis, data=values, dimension_names=[axis], attributes=attributes)
                 if times_s is not None:
                     times = np.asarray(times_s, np.float64)
-                    group.create_array("time", data=times, dimension_names=["t"], attributes=_TIME)
+                    group.create_array("time", data=times, dimension_names=["t"], attributes=TIME)
                 for name in (*names, "status"):
                     _create_map(group, name, f"{name}_std" in names, shape, chunk)
                 (scratch / "status" / ".done").mkdir()
@@ -337,7 +337,7 @@ def _create_map(group: zarr.Group, name: str, has_std: bool, shape: tuple[int, .
         chunks=chunk,
         dtype=empty_map(name, ()).dtype,
         fill_value=empty_map(name, ()).item(),
-        dimension_names=list(_COORDINATES),
+        dimension_names=list(COORDINATES),
         attributes=attributes,
         compressors=_COMPRESSOR,
         filters=None,

@@ -161,9 +161,13 @@ def assert_equal_to_twin(folder: Path, choice: dict[str, object], maps: dict[str
         own.append(solved(one, flows.columns, flows.sampling))
     shift = tuple(float(p) for p in plan.preshift)
     view = View(geometry.f_px, geometry.principal_px, geometry.baseline_mm, shift, x, y, 4, 1, 1, 1)
-    found = patch.measure(solved(block, problem.columns, sampling), problem, view, x, y, own)
+    arguments = (solved(block, problem.columns, sampling), problem, view, x, y, own)
+    found = patch.measure(*arguments)
     others = {"growth_rate", "normal_flow_x", "normal_flow_y", "confidence", "identified"}
-    assert {name for name in maps if not name.endswith("_std")} - others == set(found)
+    correlations = patch.velocity_correlations(*arguments) if problem.unknowns > 1 else {}
+    for name, value in correlations.items():  # stored to 3e-5
+        assert maps[name][1] == pytest.approx(value, abs=1e-4), name
+    assert {name for name in maps if not name.endswith("_std")} - others - set(correlations) == set(found)
     for name, (value, std) in found.items():
         # Maps are stored in single precision.
         assert maps[name][1] == pytest.approx(value, rel=1e-6, abs=1e-4 * std), name

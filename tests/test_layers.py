@@ -46,8 +46,14 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("expected", "correlation"), 6),
     **dict.fromkeys(("colours", "display"), 2),
     **dict.fromkeys(("panels", "report"), 7),
+    **dict.fromkeys(("surface_growth",), 7),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
+    **dict.fromkeys(("tables",), 3),
+    **dict.fromkeys(("exporters", "labels", "following", "region_noise", "regions", "diel"), 7),
+    **dict.fromkeys(("napari_reader",), 7),
     **dict.fromkeys(("rig", "rig_choices", "inspection", "inspection_advice", "inspection_report"), 7),
+    **dict.fromkeys(("drift", "interpolation"), 3),
+    **dict.fromkeys(("point_maps", "tracking"), 7),
     **dict.fromkeys(("cli",), 8),
 }
 """Part of the package -> layer. A part imports from lower layers and, without cycles, from its own."""

@@ -430,13 +430,25 @@ def flow_gradient(p, cov, columns: ColumnSet):
     return {name: (w @ p, np.sqrt(w @ cov @ w)) for name, w in weights.items()}
 
 
-def velocity_differences(solved, problem, view, x, y, own=()):
-    """Covariances of the velocity's central differences: name -> (value, geometric mean of its variances)."""
+def motion_spreads(solved, problem, view, x, y, own=()):
+    """Covariances of the motion, and of its central differences along x and y."""
     columns, sampling = problem.columns, problem.sampling
     P, cov = solved.P, solved.covariances(columns, sampling, DENOISE[problem.estimator])
     geometry = fit_geometry(P, cov, columns, view.baseline_mm, view.shift_px, problem.weighted)
     x0, y0 = x - view.principal_px[0], y - view.principal_px[1]
-    _, (_, *spreads), _ = fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own)
+    return fit_motion(x0, y0, solved, P, cov, geometry, problem, view, own)[1]
+
+
+def velocity_correlations(solved, problem, view, x, y, own=()):
+    """Correlations of the errors of the velocity's components."""
+    C = motion_spreads(solved, problem, view, x, y, own)[0]
+    pairs = [pair for pair in ((0, 1), (0, 2), (1, 2)) if max(pair) < problem.unknowns]
+    return {f"velocity_correlation_{'xyz'[i]}{'xyz'[j]}": C[i, j] / np.sqrt(C[i, i] * C[j, j]) for i, j in pairs}
+
+
+def velocity_differences(solved, problem, view, x, y, own=()):
+    """Covariances of the velocity's central differences: name -> (value, geometric mean of its variances)."""
+    _, *spreads = motion_spreads(solved, problem, view, x, y, own)
     found = {}
     for axis, C in zip(("x", "y"), spreads, strict=True):
         for a, b in ("xx", "xy", "yy", "xz", "yz", "zz"):

@@ -1,0 +1,125 @@
+"""The documentation is true: its commands run, its settings are all there are, its output is what is printed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import pytest
+from documentation import PAGES, README, ROOT, Session, agree, blocks, calls
+from pydantic import BaseModel
+
+import leafflow_ti
+from docs._ext.program import commands, help_of
+from leafflow_ti.capture.description import Description
+from leafflow_ti.cli.main import COMMANDS, invoke
+from leafflow_ti.config import RunConfig
+
+pytestmark = pytest.mark.xdist_group("docs")
+
+CONTINUES = {"growth.md": "getting-started.md", "opening.md": "growth.md", "formats.md": "getting-started.md"}
+"""Pages that go on with the files of another one."""
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    """A folder for all pages; figures are drawn into memory."""
+    before = matplotlib.get_backend()
+    matplotlib.use("agg")
+    yield Session(tmp_path_factory.mktemp("docs"))
+    matplotlib.pyplot.close("all")
+    matplotlib.use(before)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_what_a_page_shows_runs(page: Path, session: Session) -> None:
+    if page.name in CONTINUES:
+        session.try_out(page.with_name(CONTINUES[page.name]))
+    session.try_out(page)
+
+
+def test_what_the_readme_shows_runs(tmp_path: Path) -> None:
+    invoke(["simulate", "cube", str(tmp_path / "own"), "--size", "240x120"])  # "your own images"
+    Session(tmp_path / "own").try_out(README)
+
+
+# --- nothing is forgotten, nothing invented --------------------------------------------------------------------------
+
+
+def settings(model: type[BaseModel]) -> dict[str, Any]:
+    """Dotted key of every setting -> its field."""
+    found: dict[str, Any] = {}
+    for name, field in model.model_fields.items():
+        parts = [t for t in (field.annotation, *getattr(field.annotation, "__args__", ())) if isinstance(t, type)]
+        section = next((t for t in parts if issubclass(t, BaseModel)), None)
+        found |= {f"{name}.{key}": f for key, f in settings(section).items()} if section else {name: field}
+    return found
+
+
+def table_keys(text: str, title: str) -> list[str]:
+    """Dotted keys in the first column of the tables below the heading ``title``: ``### [section]``, then ``| `key` |``."""
+    part = text.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+    section, keys = "", []
+    for line in part.splitlines():
+        if heading := re.match(r"### (?:`\[(\w+)\]`)?", line):
+            section = f"{heading[1]}." if heading[1] else ""
+        elif row := re.match(r"\| `(\w+)` \|", line):
+            keys.append(section + row[1])
+    return keys
+
+
+@pytest.mark.parametrize(
+    ("title", "model"), [("The capture: `capture.toml`", Description), ("Settings of a run: `run.toml`", RunConfig)]
+)
+def test_the_reference_of_settings_is_complete(title: str, model: type[BaseModel]) -> None:
+    listed = table_keys((ROOT / "docs/formats.md").read_text(encoding="utf-8"), title)
+    assert len(set(listed)) == len(listed)
+    assert set(listed) == set(settings(model))
+
+
+@pytest.mark.parametrize("page", [*PAGES, README], ids=lambda page: page.stem)
+def test_options_and_commands_in_the_text_exist(page: Path) -> None:
+    prose = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    code = re.findall(r"`([^`\n]+)`", prose)
+    options = {found for text in code for found in re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)}
+    named = {found for text in code for found in re.findall(r"^leafflow-ti ([a-z][a-z-]*)", text)}
+    assert named <= set(COMMANDS)
+    assert options <= known_options() | {"--quick", "--json", "--out"}  # the latter of `python -m perf`
+
+
+def known_options() -> set[str]:
+    """All options of all commands."""
+    return {found for words in commands() for found in re.findall(r"(?<![\w-])--[a-z][a-z-]+", help_of(*words))}
+
+
+def test_every_page_is_in_the_contents() -> None:
+    index = (ROOT / "docs/index.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^([\w-]+)$", "".join(b.text for b in blocks(ROOT / "docs/index.md")), re.MULTILINE)
+    assert sorted(listed) == sorted(page.stem for page in PAGES if page.stem != "index"), index
+
+
+def test_public_names_have_documentation() -> None:
+    assert all(getattr(leafflow_ti, name).__doc__ for name in leafflow_ti.__all__)
+
+
+# --- the test's own tools --------------------------------------------------------------------------------------------
+
+
+def test_shown_output_is_compared() -> None:
+    assert agree(["depth", "mm", "…", "9.85"], ["depth", "mm", "971", "9.86"])
+    assert not agree(["depth", "mm", "…", "9.85"], ["depth", "mm", "971", "9.2"])
+    assert not agree(["done"], ["done", "in", "3", "s"])
+    assert agree(["done", "in", "…", "s"], ["done", "in", "3", "s"])
+
+
+def test_calls_are_found_with_their_output(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("text\n\n```console\n$ leafflow-ti info a  # why\nframes 3\n\n$ make test\n```\n", encoding="utf-8")
+    (block,) = blocks(page)
+    first, second = calls(block)
+    assert first.words == ("leafflow-ti", "info", "a")
+    assert first.shown == ("frames 3",)
+    assert (first.line, second.words) == (4, ("make", "test"))
