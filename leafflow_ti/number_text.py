@@ -20,10 +20,11 @@ def with_error(value: float, error: float) -> str:
     """Value and standard error, both to the error's second digit: ``0.412 ± 0.013``."""
     if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
         return readable(value)
-    decimals = max(0, 1 - math.floor(math.log10(error)))
-    if decimals > 6:
+    if max(abs(value), error) < 1e-4:
         return f"{readable(value, 2)} ± {readable(error, 2)}"
-    return f"{value:.{decimals}f} ± {error:.{decimals}f}".replace("-", "−")
+    decimals = min(max(0, 1 - math.floor(math.log10(error))), 9)
+    shown = 0.0 if abs(value) < 0.5 * 10**-decimals else value  # no minus before zeros alone
+    return f"{shown:.{decimals}f} ± {error:.{decimals}f}".replace("-", "−")
 
 
 def to_digits_of(value: float, error: float | None) -> str:
@@ -31,9 +32,12 @@ def to_digits_of(value: float, error: float | None) -> str:
     return readable(value, 4) if error is None else with_error(value, error).partition(" ±")[0]
 
 
-def round_steps(low: float, high: float, most: int) -> list[float]:
-    """At most ``most`` + 1 multiples of 1, 2 or 5 times a power of ten from ``low`` to ``high``, which differ."""
-    raw = (high - low) / most
+def round_steps(low: float, high: float, most: int, least: float = 0.0) -> list[float]:
+    """At most ``most`` + 1 multiples of 1, 2 or 5 times a power of ten from ``low`` to ``high``, which differ.
+
+    ``least``: what they are apart at least.
+    """
+    raw = max((high - low) / most, least)
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(m * power for m in (1, 2, 5, 10) if m * power >= raw * (1 - 1e-9))
     first = math.ceil(low / step - 1e-9)

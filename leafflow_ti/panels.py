@@ -116,8 +116,8 @@ class Panel:
 
     @property
     def unit(self) -> str:
-        """Unit of the values shown: growth and strain per hour where the time between frames is known."""
-        return shown_in(self.needs[0], self.interval_s)[0] if self.needs else ""
+        """Unit of the values shown, growth and strain per hour where the time between frames is known; else empty."""
+        return shown_in(self.needs[0], self.interval_s)[0] if self.kind in ("map", "arrows") else ""
 
     def values(self, field: Field) -> NDArray[np.floating]:
         """Values [y, x] in ``unit`` that the colours show; ValueError for normals and statuses, which have no scale."""

@@ -250,7 +250,7 @@ def _row(
     if "depth" in part:
         row |= _area(part, weights, row["valid_share"], noise) | _attitude(part, weights, noise)
     for name in names:
-        row |= _mean(name, part, weights, noise)
+        row |= mean_over(name, part, weights, noise)
     return row
 
 
@@ -295,8 +295,11 @@ def _error(name: str, part: Mapping[str, Floats], weights: Floats, noise: Region
     return float(np.sqrt(mean_variance(weights / weights.sum(), std, noise.terms(name, near))))
 
 
-def _mean(name: str, part: Mapping[str, Floats], weights: Floats, noise: RegionNoise) -> dict[str, float]:
-    """Mean, its standard error and the standard deviation of one map over a region, in the map's own unit."""
+def mean_over(name: str, part: Mapping[str, Floats], weights: Floats, noise: RegionNoise) -> dict[str, float]:
+    """Mean, its standard error and the standard deviation of one map over a region, in the map's own unit.
+
+    ``part``: maps [y, x] of the region, NaN where a pixel does not count; ``weights`` [y, x].
+    """
     known = np.isfinite(part[name])
     if f"{name}_std" in part:
         known &= np.isfinite(part[f"{name}_std"])

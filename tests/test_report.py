@@ -18,13 +18,12 @@ from report_stores import GROWTH, GROWTH_STD, PLAN, make_store
 
 import leafflow_ti
 from leafflow_ti.cli.main import main
-from leafflow_ti.correlation import NoiseCorrelation
 from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
 from leafflow_ti.mesh import surface_mesh
 from leafflow_ti.number_text import axis_labels, duration, readable, round_steps, to_digits_of, with_error
 from leafflow_ti.report import LIMIT, facts, write_report
 from leafflow_ti.report.charts import curves
-from leafflow_ti.report.facts import Series, mean_and_error, spread_evenly
+from leafflow_ti.report.facts import Series, certain, spread_evenly
 from leafflow_ti.report.regions_table import read_region_curves
 from leafflow_ti.report.surface import packed, packed_surfaces
 
@@ -68,6 +67,13 @@ def written(folder: Path, **options: Any) -> str:
     return write_report(store, folder / "page.html").read_text(encoding="utf-8")
 
 
+def growth_in(text: str, unit: str) -> tuple[float, float]:
+    """Growth and its standard error, as the page's first lines give them."""
+    found = re.search(rf"([\d.]+) ± ([\d.]+) {unit}", text)
+    assert found is not None, text[:500]
+    return float(found[1]), float(found[2])
+
+
 def data_of(page: str) -> dict[str, Any]:
     """What the page's script works with."""
     found: dict[str, Any] = json.loads(parts_of(page).scripts[0])
@@ -86,7 +92,8 @@ def test_page_tells_what_was_measured(tmp_path: Path) -> None:
     page = written(tmp_path)
     text = " ".join("".join(parts_of(page).text).split())
     assert "frames 2 to 4, one every 2 min" in text
-    assert "6.000 ± 0.018 %/h" in text  # .2 %/frame on average, every 2 min
+    # .2 %/frame on average, one frame every 2 min; the pixels of the three frames are independent.
+    assert growth_in(text, "%/h") == pytest.approx((6.0, 0.6 / (3 * 30 * 37) ** 0.5), rel=0.06)
     assert "affine-scene-flow" in text
     assert "33 × 33 px, 3 frames, stride 2" in text
     assert "45 files" in text
@@ -211,8 +218,7 @@ def test_flow_alone_has_no_surface_and_no_growth(tmp_path: Path) -> None:
 
 def test_growth_without_a_known_interval_is_per_frame(tmp_path: Path) -> None:
     text = "".join(parts_of(written(tmp_path, interval_s=None)).text)
-    assert "0.20000 ± 0.00060" in text
-    assert "%/frame" in text
+    assert growth_in(text, "%/frame") == pytest.approx((0.2, 0.02 / (3 * 30 * 37) ** 0.5), rel=0.03)
     assert "%/h" not in text
 
 
@@ -223,23 +229,23 @@ def test_single_frame_has_no_slider(tmp_path: Path) -> None:
 # --- its numbers -----------------------------------------------------------------------------------------------------
 
 
-def test_standard_error_of_a_mean_is_that_of_simulated_noise() -> None:
-    """Errors with the correlation that the store states scatter as much as the mean's error says."""
-    rng = np.random.default_rng(0)
-    kernel = np.array([1.0, 1.0, 1.0]) / 3**0.5
-    correlation = NoiseCorrelation(*(np.correlate(kernel, kernel, "full")[2:] for _ in "xy"), np.ones(1))
-    std = 0.1 + 0.1 * rng.random((12, 17))
-    std[3:5, :6] = np.nan
-    means = []
-    for _ in range(1500):
-        white = rng.normal(size=(14, 19))
-        rows = sum(kernel[i] * white[i : i + 12] for i in range(3))
-        means.append(mean_and_error(std * sum(kernel[i] * rows[:, i : i + 17] for i in range(3)), std, correlation)[0])
-    _, error = mean_and_error(np.where(np.isfinite(std), 0.0, np.nan), std, correlation)
-    assert np.std(means) / error == pytest.approx(1, abs=0.06)  # 1500 draws tell a scatter to 1.8 %
-    assert mean_and_error(np.full((2, 2), np.nan), np.ones((2, 2)), correlation) == pytest.approx(
-        (np.nan,) * 2, nan_ok=True
-    )
+def test_a_few_bad_pixels_do_not_spoil_the_mean(tmp_path: Path) -> None:
+    """One pixel with an error, and a value, a thousand times the others'."""
+    store = make_store(tmp_path / "s.zarr", frames=(0,))
+    before = facts.Facts.of(store).growth[0]
+    for name, value in (("growth_rate", -50 * GROWTH), ("growth_rate_std", 1000 * GROWTH_STD)):
+        values = store.read(name, 0)
+        values[15, 20] = value
+        store.write_map(name, 0, values)
+    after = facts.Facts.of(store).growth[0]
+    assert after.mean == pytest.approx(before.mean, rel=1e-3)
+    assert after.error == pytest.approx(before.error, rel=0.01)
+
+
+def test_pixels_as_good_as_the_median_count_alike() -> None:
+    weights = certain(np.array([[1.0, 2.0, 2.0], [4.0, np.nan, np.inf]]))
+    assert weights == pytest.approx(np.array([[1.0, 1.0, 1.0], [0.25, 0.0, 0.0]]))
+    assert not certain(np.full((2, 2), np.nan)).any()
 
 
 def test_growth_rests_on_pixels_that_are_ok(tmp_path: Path) -> None:
@@ -248,7 +254,8 @@ def test_growth_rests_on_pixels_that_are_ok(tmp_path: Path) -> None:
     (series,) = found.growth
     assert series.mean == pytest.approx([30 * GROWTH * (1 + i) for i in range(3)], rel=1e-5)
     independent = 30 * 37  # at the pitch of 2 px, neighbours share nothing
-    assert series.error == pytest.approx(np.full(3, 30 * GROWTH_STD / independent**0.5), rel=1e-5)
+    # Pixels stand for nearly the same area, so the mean's error is nearly that of equal weights.
+    assert series.error == pytest.approx(np.full(3, 30 * GROWTH_STD / independent**0.5), rel=0.02)
     assert found.measured == pytest.approx([37 / 40] * 3)
 
 
@@ -261,6 +268,8 @@ def test_numbers_as_people_read_them() -> None:
         "–",
     ]
     assert with_error(0.41234, 0.0131) == "0.412 ± 0.013"
+    assert with_error(0.04003, 5.7e-5) == "0.040030 ± 0.000057"
+    assert with_error(-1e-7, 2e-3) == "0.0000 ± 0.0020"
     assert with_error(-2e-8, 1.3e-7) == "−2.0e−8 ± 1.3e−7"
     assert with_error(5.0, float("nan")) == "5.00"
     assert to_digits_of(249.98765, 0.0068) == "249.9877"
@@ -270,6 +279,7 @@ def test_numbers_as_people_read_them() -> None:
     ]  # fmt: skip
     steps = round_steps(-0.013, 0.042, 5)
     assert axis_labels(steps) == ["0", "0.02", "0.04"]
+    assert axis_labels(round_steps(4, 7, 6, 1.0)) == ["4", "5", "6", "7"]
     assert axis_labels(round_steps(3, 9, 6)) == ["3", "4", "5", "6", "7", "8", "9"]
 
 
@@ -313,7 +323,7 @@ def test_packed_surface_is_that_of_the_mesh(tmp_path: Path) -> None:
     velocity = unpack(frame["arrows"], np.uint16, 3).view(np.int16) * found["step"]
     expected = np.stack([mesh.at(field[f"velocity_{a}"])[tails] for a in "xyz"], axis=-1)
     assert velocity == pytest.approx(expected, abs=found["step"])
-    assert 100 < len(tails) < 400
+    assert 50 < len(tails) < 200
     centre, radius = np.array(found["view"][:3]), found["view"][3]
     assert (np.linalg.norm(mesh.vertices - centre, axis=1) < 1.1 * radius).all()
 

@@ -26,7 +26,7 @@ def format_progress(progress: Progress) -> str:
     share = progress.pixels_done / progress.pixels_total if progress.pixels_total else 1.0
     parts = [f"unit {progress.done_units}/{progress.total_units}", f"{share:.0%}"]
     if progress.pixels_per_second is not None and progress.seconds_left is not None:
-        parts += [format_rate(progress.pixels_per_second), f"{duration(progress.seconds_left)} left"]
+        parts += [format_rate(progress.pixels_per_second), f"{duration(round(progress.seconds_left))} left"]
     return ", ".join(parts)
 
 

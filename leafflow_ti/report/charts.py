@@ -37,7 +37,7 @@ class _Axes:
 
     def frame(self, x_label: str, y_label: str) -> list[str]:
         """Grid lines, numbers and names of both axes."""
-        rows, columns = round_steps(*self.y, 5), round_steps(*self.x, 6)
+        rows, columns = round_steps(*self.y, 5), round_steps(*self.x, 6, 1.0)  # whole frames
         right, base = WIDTH - RIGHT, HEIGHT - BOTTOM
         parts = []
         for y, text in zip(rows, axis_labels(rows), strict=True):

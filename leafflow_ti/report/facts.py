@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.correlation import NoiseCorrelation
 from leafflow_ti.display import Medians
-from leafflow_ti.field import WITHOUT_STD
-from leafflow_ti.panels import shown_in
+from leafflow_ti.field import WITHOUT_STD, Field
+from leafflow_ti.panels import quantity_title, shown_in
+from leafflow_ti.region_noise import RegionNoise
+from leafflow_ti.regions import mean_over, over_frames, surface_area
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import HAS_VALUE, Status
 
@@ -22,6 +23,8 @@ GROWTH = ("growth_rate", "area_rate")
 """Measures of growth whose course is shown: by the refinement, and from the motion."""
 MEASURED = tuple(code for code in HAS_VALUE if code != Status.COARSE)
 """Codes of pixels whose values have standard errors."""
+_SURFACE = ("depth", "slope_x", "slope_y", "velocity_z_std")
+"""What the area of a pixel, and the errors of a mean growth, need beside it."""
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +33,8 @@ Floats = NDArray[np.float64]
 class Series:
     """A quantity over frames: ``x`` [n] as the axis counts them, ``mean`` and ``error`` [n], NaN where there is none.
 
-    ``spread``: the 16th and 84th percentile of the pixels [2, n]; None where they are not known.
+    ``spread``: the 16th and 84th percentile of the pixels [2, n]; None where they are not known. ``correlation``: of
+    the errors at 0, 1, 2, ... frames.
     """
 
     name: str
@@ -38,15 +42,12 @@ class Series:
     mean: Floats
     error: Floats
     spread: Floats | None = None
+    correlation: tuple[float, ...] = (1.0,)
 
     def overall(self) -> tuple[float, float] | None:
-        """Mean over the frames and its standard error; None without any value.
-
-        Neighbouring frames share images, so their errors are taken as the same, which is safe: the error of the mean
-        is the mean of the errors.
-        """
-        known = np.isfinite(self.mean) & np.isfinite(self.error)
-        return (float(self.mean[known].mean()), float(self.error[known].mean())) if known.any() else None
+        """Mean over the frames and its standard error; None without any value."""
+        mean, error = over_frames(self.mean, self.error, self.correlation)
+        return (mean, error) if np.isfinite(mean) else None
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ class Facts:
             for code, count in found.items():
                 statuses[code] = statuses.get(code, 0) + count
         unit, _ = shown_in(GROWTH[0], store.interval_s)
-        growth = tuple(_course(store, name, done) for name in GROWTH if name in store.names)
+        begun = [int(t) for t in np.flatnonzero(done)]
+        growth = tuple(_course(store, name, begun) for name in GROWTH if name in store.names)
         return cls(done, measured, statuses, tuple(s for s in growth if np.isfinite(s.mean).any()), unit)
 
     @property
@@ -117,31 +119,37 @@ def precision_of(store: ResultStore, frames: Sequence[int]) -> list[Precision]:
     return found
 
 
-def mean_and_error(values: Floats, std: Floats, correlation: NoiseCorrelation) -> tuple[float, float]:
-    """Mean of a map [y, x] over the pixels that have a value and a finite standard error, and the error of that mean.
+def certain(std: Floats) -> Floats:
+    """Weights of pixels with these standard errors [y, x], 0 where they are not finite.
 
-    The variance is Σ_ij σ_i σ_j R_ij / n², R the product of ``correlation`` along y and x. NaN, NaN without a pixel.
+    All that are as good as the median count alike, so that a mean is one over the surface, not over its sharpest
+    texture; worse ones count less, as 1/std², so that a few bad ones cannot spoil it.
     """
-    known = np.isfinite(values) & np.isfinite(std)
-    n = int(known.sum())
-    if not n:
-        return np.nan, np.nan
-    sigma = np.where(known, std, 0.0)
-    rows, columns = (correlation.between(axis, size) for axis, size in zip("yx", sigma.shape, strict=True))
-    variance = float((sigma * (rows @ sigma @ columns)).sum()) / n**2
-    return float(values[known].mean()), float(np.sqrt(max(variance, 0.0)))
+    known = np.isfinite(std) & (std > 0)
+    if not known.any():
+        return np.zeros(std.shape)
+    return np.where(known, np.minimum(1.0, np.median(std[known]) / np.where(known, std, 1.0)) ** 2, 0.0)
 
 
-def _course(store: ResultStore, name: str, done: Floats) -> Series:
+def _course(store: ResultStore, name: str, begun: Sequence[int]) -> Series:
+    """Growth of the pixels that are ok, weighted by their area and by how certain they are."""
     _, factor = shown_in(name, store.interval_s)
-    correlation = NoiseCorrelation.of(store)
+    noise = RegionNoise.of(store)
     n = len(store.frames)
     mean, error, spread = np.full(n, np.nan), np.full(n, np.nan), np.full((2, n), np.nan)
-    for t in np.flatnonzero(done):
-        values, std = (store.read(key, int(t)).astype(np.float64) for key in (name, f"{name}_std"))
-        values[store.read("status", int(t)) != Status.OK] = np.nan  # others have errors of another kind
-        mean[t], error[t] = mean_and_error(values, std, correlation)
-        known = values[np.isfinite(values) & np.isfinite(std)]
-        if known.size:
-            spread[:, t] = np.percentile(known, (16, 84))
-    return Series(name.replace("_", " "), np.array(store.frames, float), mean * factor, error * factor, spread * factor)
+    needed = [key for key in (name, f"{name}_std", *_SURFACE) if key in store.names]
+    for t in begun:
+        status = store.read("status", t)
+        maps = {key: np.where(status == Status.OK, store.read(key, t), np.float32(np.nan)) for key in needed}
+        field = Field(maps, status, store.y, store.x, store.frames[t], store.attrs)
+        area = surface_area(field)
+        part = {key: values.astype(np.float64) for key, values in maps.items()}
+        weights = np.where(np.isfinite(area), area, 0.0) * certain(part[f"{name}_std"])
+        found = mean_over(name, part, weights, noise)
+        if found:
+            mean[t], error[t] = found[name], found[f"{name}_se"]
+            spread[:, t] = np.percentile(part[name][np.isfinite(part[name]) & (weights > 0)], (16, 84))
+    frames = tuple(noise.frames.tolist())
+    return Series(
+        quantity_title(name), np.array(store.frames, float), mean * factor, error * factor, spread * factor, frames
+    )

@@ -76,9 +76,12 @@ def growth_section(facts: Facts, regions: Sequence[Series], region_unit: str, sh
         overall = series.overall()
         words = "" if overall is None else f"; mean {with_error(*overall)} {facts.growth_unit}"
         chart = curves([series], "frame", facts.growth_unit, f"{series.name} over the frames{words}", marks)
+        note = (
+            f"{what}: mean over the surface, uncertain pixels counting less; band: its standard error; grey: the "
+            "middle 68 % of the pixels"
+        )
         charts.append(
-            f"<figure><figcaption><b>{escape(series.name)}</b><span>{what}: mean of the measured pixels, band: its "
-            f"standard error; grey: the middle 68 % of the pixels</span></figcaption>{chart}</figure>"
+            f"<figure><figcaption><b>{escape(series.name)}</b><span>{note}</span></figcaption>{chart}</figure>"
         )
     if regions:
         chart = curves(regions, "frame", region_unit, "growth of each region over the frames", marks)

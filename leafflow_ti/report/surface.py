@@ -18,7 +18,7 @@ from leafflow_ti.field import Field
 from leafflow_ti.mesh import surface_mesh
 
 STEPS = 65535
-ARROWS = 16
+ARROWS = 13
 """Arrows along the longer side."""
 
 VELOCITY = ("velocity_x", "velocity_y", "velocity_z")

@@ -139,7 +139,7 @@ class SurfaceView {
   setArrows() {
     if (!this.surface) return;
     const spans = this.surface.motion.map((v) => v * this.magnification);
-    const [points, normals] = arrowTriangles(this.surface.tails, spans, 0.007 * this.radius);
+    const [points, normals] = arrowTriangles(this.surface.tails, spans, 0.0055 * this.radius);
     this.corners = points.length / 3;
     this.fill(this.shafts, [points, normals, new Float32Array(2 * this.corners)]);
     this.redraw();
@@ -187,7 +187,7 @@ class SurfaceView {
       gl.bindVertexArray(this.shafts.array);
       gl.enable(gl.CULL_FACE);
       // Dark arrows with a light rim, the inside of slightly thicker ones, are seen on any colour.
-      for (const [grey, side, swell] of [[1.35, gl.FRONT, 0.004 * this.radius / Math.sqrt(this.magnify)], [0.12, gl.BACK, 0]]) {
+      for (const [grey, side, swell] of [[1.35, gl.FRONT, 0.003 * this.radius / Math.sqrt(this.magnify)], [0.12, gl.BACK, 0]]) {
         gl.cullFace(side);
         gl.uniform1f(uniform.swell, swell);
         gl.uniform4f(uniform.paint, grey, grey, grey, 1);
