@@ -133,7 +133,7 @@ def _even(pitch: int) -> NDArray[np.float64]:
 
 def looked_up(image: LabelImage, points: NDArray[np.float64]) -> LabelImage:
     """Labels [n] at points (x, y) [2, n] px, that of the nearest pixel; 0 beyond the image."""
-    x, y = np.rint(points).astype(np.int64)
+    x, y = np.floor(points + 0.5).astype(np.int64)  # np.rint would take two of four halves
     height, width = image.shape
     known = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     found = np.zeros(x.size, np.int64)

@@ -16,10 +16,11 @@ from leafflow_ti.cli.main import main
 from leafflow_ti.correlation import NoiseCorrelation
 from leafflow_ti.deformation import Gauge
 from leafflow_ti.errors import InputError, MissingExtra, UsageError
-from leafflow_ti.field import CORRELATIONS, with_std
+from leafflow_ti.field import CORRELATIONS, Field, with_std
 from leafflow_ti.following import spread
 from leafflow_ti.labels import Labels, covered
 from leafflow_ti.mesh import surface_points
+from leafflow_ti.region_divergence import Adjoint, differenced, fitted
 from leafflow_ti.region_noise import RegionNoise, mean_variance
 from leafflow_ti.region_rows import surface_area
 from leafflow_ti.region_table import over_frames
@@ -28,7 +29,17 @@ from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 from leafflow_ti.surface_growth import strain_of
 from tests.flat_leaf import (
-    CORRELATION, DEPTH, F_PX, LEAF, PRINCIPAL, SIZE, X, Y, attributes, leaf_maps, write_store,
+    CORRELATION,
+    DEPTH,
+    F_PX,
+    LEAF,
+    PRINCIPAL,
+    SIZE,
+    X,
+    Y,
+    attributes,
+    leaf_maps,
+    write_store,
 )  # fmt: skip
 
 GROWTH, FLOW = 0.01, (2.5, -1.0)
@@ -284,27 +295,57 @@ def run_attributes(gauge: Gauge) -> dict[str, Any]:
     return attributes(refined=False) | {"plan": plan, "growth": {"strain_window_px": gauge.side, "average_frames": 1}}
 
 
-@pytest.mark.parametrize("region", ["inside", "at the border"])
-def test_errors_of_mean_growth_from_the_motion(region: str, tmp_path: Path) -> None:
-    """(Estimate - truth) / standard error over 40 noise realisations, one frame each, of fits that overlap much."""
-    gauge, n = Gauge.of(29, 4), 40
+@pytest.fixture(scope="module")
+def still_plane(tmp_path_factory: pytest.TempPathFactory) -> ResultStore:
+    """Thirty frames of a plane at rest, each with noise of its own, and growth as it follows from the motion."""
+    gauge = Gauge.of(29, 4)
     noise = NoiseCorrelation(autocorrelation(WINDOW), autocorrelation(WINDOW), np.ones(1))
 
     def maps(t: int) -> Mapping[str, NDArray[Any]]:
         found = dict(noisy_motion(t))
-        field = write_store(
-            tmp_path / f"f{t}.zarr", MOVING, lambda _: found, frames=(0,), attrs=run_attributes(gauge)
-        ).field(0)
+        as_f4 = {name: values.astype(np.float32) for name, values in found.items()}
+        field = Field(as_f4, np.zeros((Y.size, X.size), np.uint8), Y, X, t, run_attributes(gauge))
         strain = strain_of(field, gauge, noise).maps()
         return found | {name: strain[name] for name in ("area_rate", "area_rate_std")}
 
-    store = write_store(tmp_path / "o.zarr", MOVING, maps, frames=range(n), attrs=run_attributes(gauge))
+    path = tmp_path_factory.mktemp("still") / "out.zarr"
+    return write_store(path, MOVING, maps, frames=range(30), attrs=run_attributes(gauge))
+
+
+@pytest.mark.parametrize("region", ["inside", "at the border"])
+def test_errors_of_mean_growth_from_the_motion(region: str, still_plane: ResultStore) -> None:
+    """(Estimate - truth) / standard error over thirty noise realisations, of fits that overlap much."""
     image = np.zeros(SIZE[::-1], int)
     image[(slice(30, 90), slice(40, 120)) if region == "inside" else (slice(0, 80), slice(0, 90))] = 1
-    rows = measure_regions(store, image, still=True).of(1)
+    rows = measure_regions(still_plane, image, still=True).of(1)
     pull = rows["area_rate_percent_per_frame"] / rows["area_rate_se_percent_per_frame"]
-    assert 0.75 < np.std(pull) < 1.3  # 11 % by chance
+    assert 0.75 < np.std(pull) < 1.3  # 13 % by chance
+    # As values that do not cancel, errors would be as large as this:
     assert rows["area_rate_se_percent_per_frame"].mean() < 0.5 * rows["area_rate_sd_percent_per_frame"].mean()
+
+
+@pytest.mark.parametrize("adjoint", [differenced, fitted((2, 3))])
+def test_weights_of_velocities_are_those_of_their_derivatives(adjoint: Adjoint) -> None:
+    """``Σ along · D v = Σ adjoint(along) v`` for derivatives by hand, pixel by pixel, with gaps."""
+    rng = np.random.default_rng(5)
+    known = rng.random((8, 9)) < 0.8
+    values, along_x, along_y = rng.normal(size=(3, 8, 9))
+    along_x, along_y = (np.where(known, along, 0.0) for along in (along_x, along_y))
+    total = 0.0
+    for y, x in np.argwhere(known):
+        if adjoint is differenced:
+            slopes = []
+            for dy, dx in ((0, 1), (1, 0)):
+                ends = [(y + s * dy, x + s * dx) for s in (-1, 1)]
+                ends = [e if 0 <= e[0] < 8 and 0 <= e[1] < 9 and known[e] else (y, x) for e in ends]
+                span = sum(abs(ends[1][k] - ends[0][k]) for k in (0, 1))
+                slopes.append((values[ends[1]] - values[ends[0]]) / span if span else 0.0)
+        else:
+            at = [(i, j) for i, j in np.argwhere(known) if abs(i - y) <= 2 and abs(j - x) <= 3]
+            plane = np.array([[1, j, i] for i, j in at])
+            slopes = np.linalg.lstsq(plane, np.array([values[i, j] for i, j in at]))[0][1:]
+        total += along_x[y, x] * slopes[0] + along_y[y, x] * slopes[1]
+    np.testing.assert_allclose((adjoint(along_x, along_y, known) * values).sum(), total, rtol=1e-9)
 
 
 def test_old_stores_count_errors_as_the_same_throughout_a_window(tmp_path: Path) -> None:
