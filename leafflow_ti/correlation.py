@@ -106,12 +106,17 @@ def velocity_covariance(maps: Mapping[str, NDArray[Any]]) -> Array:
 
 
 def stated_correlation(plan: Plan) -> dict[str, list[float]]:
-    """What a run states: R at 0, 1, 2, ... px along x and y and, where there is motion, frames along t."""
+    """What a run states: R at 0, 1, 2, ... px along x and y and, where there is motion, frames along t.
+
+    ``x_gradient``, ``y_gradient``: the same of what a window tells of derivatives along x and y, as slopes and growth.
+    """
     refine, sampling = plan.refine, plan.problem.sampling
     if refine is not None:
         found = {axis: _refined_window(refine) for axis in "xy"}
+        found |= {f"{axis}_gradient": _refined_window(refine, 1) for axis in "xy"}
     else:
         found = {axis: _window(sampling.axis(axis)) for axis in "xy"}
+        found |= {f"{axis}_gradient": _window(sampling.axis(axis), 1) for axis in "xy"}
     if refine is not None and refine.motion:
         found["t"] = _autocorrelation(slope_weights(refine.frames, refine.motion > 6))
     elif sampling.t.filters is not None:
@@ -131,17 +136,17 @@ def _autocorrelation(weights: Array) -> Array:
     return np.asarray(found / found[0])
 
 
-def _window(axis: AxisSampling) -> Array:
-    """Of the model's windows, at 0, 1, 2, ... px."""
-    return _autocorrelation(np.convolve(axis.window(0), axis.kernel(False)))
+def _window(axis: AxisSampling, power: int = 0) -> Array:
+    """Of the model's windows, at 0, 1, 2, ... px; ``power`` 1: of gradients within them."""
+    return _autocorrelation(np.convolve(axis.window(power), axis.kernel(False)))
 
 
-def _refined_window(refine: Refinement) -> Array:
-    """Of the refinement's windows, at 0, 1, 2, ... px."""
+def _refined_window(refine: Refinement, power: int = 0) -> Array:
+    """Of the refinement's windows, at 0, 1, 2, ... px; ``power`` 1: of gradients within them."""
     half = refine.across // 2
     offsets = refine.thin * np.arange(-half, half + 1)
     weights = np.zeros(2 * refine.thin * half + 1)
-    weights[offsets + refine.thin * half] = np.exp(-0.5 * (offsets / refine.sigma) ** 2)
+    weights[offsets + refine.thin * half] = offsets**power * np.exp(-0.5 * (offsets / refine.sigma) ** 2)
     one_side = interpolated_noise(1, refine.degree)
     noise = np.concatenate([one_side[:0:-1], one_side])
     shared = np.convolve(np.correlate(weights, weights, "full"), noise)[weights.size + one_side.size - 2 :]

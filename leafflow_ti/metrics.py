@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from leafflow_ti.errors import InputError
+from leafflow_ti.field import PRINCIPAL_NAMES, STRAIN_NAMES, SURFACE_PRINCIPAL_NAMES, SURFACE_STRAIN_NAMES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -31,18 +32,31 @@ TRUTH_MAPS: dict[str, int | None] = {
     "flow": 2,
     "growth_rate": None,
     "strain_rate": 3,
+    "surface_strain": 3,
 }
 """Key of ``truth.npz`` -> components per pixel; None: a plain map."""
 
 LABELS = ("face", "region")
 """Keys of ``truth.npz`` with integer labels per pixel."""
 
-SCALARS = {"depth": "depth", "slope_x": "zx", "slope_y": "zy", "growth_rate": "growth_rate"}
+SCALARS = {
+    "depth": "depth",
+    "slope_x": "zx",
+    "slope_y": "zy",
+    "growth_rate": "growth_rate",
+    "area_rate": "growth_rate",
+}
 VECTORS = {"velocity": "velocity", "rotation": "omega", "acceleration": "acceleration", "flow": "flow"}
 """Map, or stem of the maps ``_x, _y[, _z]``, of the results -> key of the truth."""
 
-STRAINS = ("strain_rate_11", "strain_rate_22", "strain_rate_12")
-"""Maps of the components of the truth's ``strain_rate``."""
+TENSORS = {
+    "strain_rate": (STRAIN_NAMES, PRINCIPAL_NAMES),
+    "surface_strain": (SURFACE_STRAIN_NAMES, SURFACE_PRINCIPAL_NAMES),
+}
+"""Key of the truth -> maps of its components 11, 22, 12, and of its principal values and their direction."""
+
+ISOTROPIC = 1e-6
+"""Difference of principal strains [%/frame] below which the truth has no principal direction."""
 
 ENDPOINT_UNITS = {"velocity": "mm", "flow": "px"}
 """Vectors whose distance to the truth is reported too, and its unit (per frame)."""
@@ -106,6 +120,21 @@ def normal_error(zx: ArrayLike, zy: ArrayLike, zx_true: ArrayLike, zy_true: Arra
     return aae(np.stack([zx, zy], axis=-1), np.stack([zx_true, zy_true], axis=-1))
 
 
+def principal(strain: ArrayLike) -> Array:
+    """Largest and smallest value and direction [..., 3] of symmetric tensors (11, 22, 12) [..., 3].
+
+    The direction of the largest is an angle in rad, -π/2 to π/2, from axis 1 towards axis 2; NaN if both are alike.
+    """
+    s11, s22, s12 = np.moveaxis(np.asarray(strain, np.float64), -1, 0)
+    mean, half, angle = 0.5 * (s11 + s22), np.hypot(0.5 * (s11 - s22), s12), 0.5 * np.arctan2(2.0 * s12, s11 - s22)
+    return np.stack([mean + half, mean - half, np.where(2.0 * half < ISOTROPIC, np.nan, angle)], axis=-1)
+
+
+def _nearest_turn(angles: Array, to: Array) -> Array:
+    """Directions ``angles`` [rad], which are the same after half a turn, as they are nearest to those of ``to``."""
+    return np.asarray(to + (angles - to + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
+
+
 def summarise(errors: ArrayLike) -> Summary | None:
     """Summary of the finite values; None if there is none."""
     e = np.asarray(errors, np.float64)
@@ -134,7 +163,8 @@ def evaluate(estimate: Maps, truth: Maps, regions: Mapping[str, Mask]) -> dict[s
 
     ``estimate``: maps [h, w] named as in the results store (``depth``, ``velocity_x``, ..., standard errors as
     ``NAME_std``). ``truth``: as from ``read_truth``, at the same pixels. ``regions``: name -> mask [h, w].
-    Slopes are compared as angles of inclination. Raises InputError if they have no quantity, or no pixel, in common.
+    Slopes are compared as angles of inclination, principal directions modulo half a turn. Raises InputError if they
+    have no quantity, or no pixel, in common.
     """
     pairs = list(_pairs(estimate, truth))
     if not pairs:
@@ -253,9 +283,15 @@ def _pairs(estimate: Maps, truth: Maps) -> Iterator[tuple[str, Array, Array]]:
             name = f"{stem}_{axis}"
             if name in estimate and key in truth:
                 yield name, np.asarray(estimate[name], np.float64), np.asarray(truth[key][..., k], np.float64)
-    for k, name in enumerate(STRAINS):
-        if name in estimate and "strain_rate" in truth:
-            yield name, np.asarray(estimate[name], np.float64), np.asarray(truth["strain_rate"][..., k], np.float64)
+    for key, (components, (*values, direction)) in TENSORS.items():
+        if key not in truth:
+            continue
+        true = np.asarray(truth[key], np.float64)
+        known = np.concatenate([true, principal(true)], axis=-1)
+        for k, name in enumerate((*components, *values, direction)):
+            if name in estimate:
+                found = np.asarray(estimate[name], np.float64)
+                yield name, _nearest_turn(found, known[..., k]) if name == direction else found, known[..., k]
 
 
 def _errors(estimate: Maps, truth: Maps) -> Iterator[tuple[str, Array]]:
@@ -276,9 +312,13 @@ def _errors(estimate: Maps, truth: Maps) -> Iterator[tuple[str, Array]]:
     if "slope_x" in found and "slope_y" in found:
         (zx, zx_true), (zy, zy_true) = found["slope_x"], found["slope_y"]
         yield "normal_deg", normal_error(zx, zy, zx_true, zy_true)
-    for name in ("growth_rate", *STRAINS):
+    strains = (name for components, (*values, _) in TENSORS.values() for name in (*components, *values))
+    for name in ("growth_rate", "area_rate", *strains):
         if name in found:
             yield f"{name}_percent", found[name][0] - found[name][1]
+    for _, (*_, direction) in TENSORS.values():
+        if direction in found:
+            yield f"{direction}_deg", np.degrees(found[direction][0] - found[direction][1])
 
 
 def _has_truth(truth: Maps, shape: tuple[int, int]) -> Mask:

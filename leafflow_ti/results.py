@@ -15,8 +15,9 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import zarr
@@ -25,8 +26,12 @@ from numpy.typing import ArrayLike, NDArray
 from zarr.codecs import ZstdCodec
 from zarr.errors import NodeNotFoundError
 
-from leafflow_ti.errors import InputError, RunError, UsageError
-from leafflow_ti.field import QUANTITIES, Field, empty_map, map_attributes, with_std
+from leafflow_ti.display import results_html
+from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
+from leafflow_ti.field import QUANTITIES, Field, empty_map, map_attributes, quantity, with_std
+
+if TYPE_CHECKING:
+    import xarray
 
 WRITERS = 16
 """Chunks of a unit that are written together: the disk forces them out at once, and while kernels run, which hold the
@@ -38,16 +43,16 @@ _COMPRESSOR = ZstdCodec(level=0, checksum=False)
 _METADATA = "zarr.json"
 """The group's metadata file, attributes included (Zarr v3)."""
 
-_COORDINATES: dict[str, dict[str, Any]] = {
+COORDINATES: dict[str, dict[str, Any]] = {
     "t": {"long_name": "index of the reference frame", "units": "frame"},
     "y": {"long_name": "row in the reference image, downwards", "units": "px"},
     "x": {"long_name": "column in the reference image, to the right", "units": "px"},
 }
 
-_TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
+TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ResultStore:
     """An open results store. ``frames``, ``y``, ``x``: coordinates of the axes t, y, x; ``names``: its maps."""
 
@@ -99,7 +104,7 @@ class ResultStore:
                 group = zarr.create_group(scratch, zarr_format=3)
                 group.update_attributes({"Conventions": "CF-1.11", **attrs, "leafflow_ti_format": FORMAT})
                 for axis, values in coordinates.items():
-                    attributes = dict(_COORDINATES[axis])
+                    attributes = dict(COORDINATES[axis])
                     if axis == "t" and interval_s is not None:
                         attributes["interval_s"] = float(interval_s)
                     if axis == "t" and time_offset:
@@ -107,7 +112,7 @@ class ResultStore:
                     group.create_array(axis, data=values, dimension_names=[axis], attributes=attributes)
                 if times_s is not None:
                     times = np.asarray(times_s, np.float64)
-                    group.create_array("time", data=times, dimension_names=["t"], attributes=_TIME)
+                    group.create_array("time", data=times, dimension_names=["t"], attributes=TIME)
                 for name in (*names, "status"):
                     _create_map(group, name, f"{name}_std" in names, shape, chunk)
                 (scratch / "status" / ".done").mkdir()
@@ -261,6 +266,33 @@ class ResultStore:
         maps = {name: self.read(name, t_index) for name in self.names}
         return Field(maps, self.read("status", t_index), self.y, self.x, self.frames[t_index], self.attrs)
 
+    def to_xarray(self) -> xarray.Dataset:
+        """All frames as a Dataset with dimensions ``t, y, x`` and CF attributes, read from disk as they are used.
+
+        Raises MissingExtra where xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise MissingExtra("xarray", "xarray", "ResultStore.to_xarray") from None
+        dataset: xarray.Dataset = xarray.open_zarr(self.path, consolidated=False, chunks=None)
+        return dataset
+
+    def _repr_html_(self) -> str:
+        """The middle one of the frames that are done, and how many are."""
+        done = sorted({unit // self.bands for unit in self.done()})
+        title = f"{self.path.name} · {len(done)} of {len(self.frames)} frames · {self.y.size} x {self.x.size} (y, x)"
+        if not done:
+            return f"<p><b>{escape(title)}</b></p>"
+        field = self.field(done[len(done) // 2])
+        title = f"{title} · below: frame {field.frame}"
+        return results_html(title, field.maps, field.status, lambda name: quantity(name)[0])
+
+    def __repr__(self) -> str:
+        names = ", ".join(name for name in self.names if not name.endswith("_std"))
+        size = f"{len(self.frames)} x {self.y.size} x {self.x.size} (t, y, x)"
+        return f"<ResultStore {self.path.name}, {size}, {len(self.done())} of {self.n_units} units done: {names}>"
+
     def add_maps(self, names: Sequence[str], attrs: Mapping[str, Any]) -> ResultStore:
         """The store with further maps, empty (those it has lose their values), to be filled by ``write_map``.
 
@@ -305,7 +337,7 @@ def _create_map(group: zarr.Group, name: str, has_std: bool, shape: tuple[int, .
         chunks=chunk,
         dtype=empty_map(name, ()).dtype,
         fill_value=empty_map(name, ()).item(),
-        dimension_names=list(_COORDINATES),
+        dimension_names=list(COORDINATES),
         attributes=attributes,
         compressors=_COMPRESSOR,
         filters=None,

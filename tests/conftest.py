@@ -34,7 +34,8 @@ from leafflow_ti.stages.estimators import ESTIMATORS
 from leafflow_ti.stages.mask_moments import MaskMoments
 from leafflow_ti.stages.problem import OwnFlows, Problem, unknowns_of
 from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, Request, TensorStage
-from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
+from leafflow_ti.synthetic.material import BrightnessTerm
+from leafflow_ti.synthetic.plane import PlaneScene, render
 
 GRIDS = {"single": (1, 1), "line-x": (1, 7), "line-y": (7, 1), "square": (5, 5)}
 """Camera rows and columns. Seven cameras give three samples of 5 taps, five cameras three samples of 3 taps."""

@@ -16,7 +16,8 @@ import leafflow_ti as lf
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.stages import estimate_tables
 from leafflow_ti.status import Status
-from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render, truth
+from leafflow_ti.synthetic.material import BrightnessTerm
+from leafflow_ti.synthetic.plane import PlaneScene, render, truth
 
 Maps = dict[str, np.ndarray]
 F_PX, DEPTH_MM = 900.0, 80.0

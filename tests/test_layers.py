@@ -16,7 +16,7 @@ import leafflow_ti
 PACKAGE = Path(leafflow_ti.__file__).parent
 
 LAYERS: dict[str, int] = {
-    **dict.fromkeys(("errors", "status", "progress", "trace", "background"), 1),
+    **dict.fromkeys(("errors", "status", "progress", "trace", "background", "number_text"), 1),
     **dict.fromkeys(("kernels",), 2),
     **dict.fromkeys(
         (
@@ -44,10 +44,16 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
     **dict.fromkeys(("matching", "positions", "photometry"), 3),
     **dict.fromkeys(("expected", "correlation"), 6),
+    **dict.fromkeys(("colours", "display"), 2),
+    **dict.fromkeys(("panels", "report"), 7),
     **dict.fromkeys(("surface_growth",), 7),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
+    **dict.fromkeys(("tables",), 3),
+    **dict.fromkeys(("exporters", "labels", "following", "region_noise", "regions", "diel"), 7),
     **dict.fromkeys(("napari_reader",), 7),
     **dict.fromkeys(("rig", "rig_choices", "inspection", "inspection_advice", "inspection_report"), 7),
+    **dict.fromkeys(("drift", "interpolation", "neighbourhood"), 3),
+    **dict.fromkeys(("point_maps", "tracks", "tracking", "cumulative", "leaf_axes"), 7),
     **dict.fromkeys(("cli",), 8),
 }
 """Part of the package -> layer. A part imports from lower layers and, without cycles, from its own."""

@@ -21,6 +21,7 @@ from leafflow_ti.metrics import (
     evaluate,
     label_regions,
     normal_error,
+    principal,
     read_truth,
     sample_maps,
     summarise,
@@ -153,6 +154,49 @@ def test_strain_is_compared_by_component() -> None:
     assert set(report.errors) == {"strain_rate_22_percent"}
     assert report.errors["strain_rate_22_percent"].mean == pytest.approx(0.1)
     assert report.coverage["strain_rate_22"].mean == pytest.approx(1.0)
+
+
+def test_principal_axes_of_a_known_tensor() -> None:
+    for turn in (-1.5, -0.4, 0.0, 0.7, 1.5):
+        c, s = np.cos(turn), np.sin(turn)
+        tensor = np.array([0.3 * c * c + 0.1 * s * s, 0.3 * s * s + 0.1 * c * c, 0.2 * c * s])
+        np.testing.assert_allclose(principal(tensor), [0.3, 0.1, turn], atol=1e-12)
+    assert principal([0.2, 0.2, 0.0]).tolist()[:2] == [0.2, 0.2]
+    assert np.isnan(principal([0.2, 0.2, 0.0])[2])
+
+
+def test_growth_from_motion_is_compared_with_its_truth() -> None:
+    """Area, surface strain and both sets of principal axes; directions are the same after half a turn."""
+    truth = {
+        "growth_rate": np.array([[0.1, 0.1, 0.1]]),
+        "strain_rate": np.array([[[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.05, 0.05, 0.0]]]),
+        "surface_strain": np.array([[[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.05, 0.05, 0.0]]]),
+    }
+    estimate = {
+        "area_rate": np.array([[0.12, 0.1, 0.09]]),
+        "surface_strain_11": np.array([[0.13, 0.0, 0.05]]),
+        "surface_principal_1": np.array([[0.13, 0.1, 0.05]]),
+        "surface_angle": np.array([[0.1, -np.pi / 2 + 0.2, 1.0]]),
+        "surface_angle_std": np.array([[0.1, 0.1, 0.1]]),
+        "principal_rate_2": np.array([[0.02, 0.02, 0.05]]),
+        "principal_rate_2_std": np.array([[0.01, 0.01, 0.01]]),
+        "principal_angle": np.array([[3.0, 1.5, np.nan]]),
+    }
+    report = evaluate(estimate, truth, {"all": np.ones((1, 3), np.bool_)})["all"]
+    means = {name: (found.n, round(found.mean, 9)) for name, found in report.errors.items()}
+    assert means == {
+        "area_rate_percent": (3, round(0.01 / 3, 9)),
+        "surface_strain_11_percent": (3, 0.01),
+        "surface_principal_1_percent": (3, 0.01),
+        "surface_angle_deg": (2, round(np.degrees(0.15), 9)),  # none where strain is alike in all directions
+        "principal_rate_2_percent": (3, round(0.04 / 3, 9)),
+        "principal_angle_deg": (2, round(np.degrees(0.5 * (3.0 - np.pi + 1.5 - np.pi / 2)), 9)),
+    }
+    assert report.coverage["surface_angle"].mean == pytest.approx(1.5)
+    assert report.coverage["principal_rate_2"].within_1 == pytest.approx(1 / 3)
+    table = "\n".join(format_reports({"all": report}))
+    assert "surface_angle [°]" in table
+    assert "area_rate [%/frame]" in table
 
 
 def test_evaluate_needs_something_in_common() -> None:

@@ -19,7 +19,8 @@ from leafflow_ti.config import load_config
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import gaussian_radius
 from leafflow_ti.stages.prefilter import PREFILTERS, Prefilter
-from leafflow_ti.synthetic.plane import BrightnessTerm, render, truth
+from leafflow_ti.synthetic.material import BrightnessTerm
+from leafflow_ti.synthetic.plane import render, truth
 from leafflow_ti.synthetic.write import write_scene
 
 SIGMA = 2.3

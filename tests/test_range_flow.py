@@ -40,7 +40,8 @@ from leafflow_ti.stages.tensor import EXTRA_PLANES, Band, TensorStage
 from leafflow_ti.stages.thresholds import DENOISE
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic import cube
-from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
+from leafflow_ti.synthetic.material import BrightnessTerm
+from leafflow_ti.synthetic.plane import PlaneScene, render
 
 PIXEL = AxisSampling.gaussian(filter_set("5"), 15, 4.4)
 SAMPLING = Sampling(PIXEL, PIXEL, t=AxisSampling.gaussian(filter_set("5"), 3, 1.0))

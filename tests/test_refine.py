@@ -14,8 +14,9 @@ from leafflow_ti.field import PRINCIPAL_NAMES, STRAIN_NAMES
 from leafflow_ti.refinement import _derived
 from leafflow_ti.runtime import Device
 from leafflow_ti.stages.refine import Refined
+from leafflow_ti.synthetic.material import BrightnessTerm
 from leafflow_ti.synthetic.moving_patch import true_state
-from leafflow_ti.synthetic.plane import BrightnessTerm, truth
+from leafflow_ti.synthetic.plane import truth
 
 pytestmark = pytest.mark.xdist_group("refine")
 Start = Callable[[str], Device]

@@ -195,7 +195,7 @@ def test_strain_is_measured(capture: Capture) -> None:
 
 
 def test_velocities_have_the_correlations_of_their_covariance(capture: Capture, refined: lf.Field) -> None:
-    """The refinement's where it is refined: that makes the covariance of what the image shows, far off the axis, too."""
+    """The refinement's, where it is refined; with the standard errors they make a covariance."""
     ok = refined.status == Status.OK
     covariance = velocity_covariance(refined)[ok]
     assert (np.linalg.eigvalsh(covariance / np.trace(covariance, axis1=1, axis2=2)[:, None, None]) > -1e-4).all()

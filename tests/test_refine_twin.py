@@ -12,8 +12,9 @@ from reference import refine as twin
 from leafflow_ti.errors import UsageError
 from leafflow_ti.synthetic.bound import cramer_rao, light_terms
 from leafflow_ti.synthetic.geometry import plane_axes
+from leafflow_ti.synthetic.material import BrightnessTerm
 from leafflow_ti.synthetic.moving_patch import Views, directions, pulled_back, true_state, warp, window
-from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render, render_image, truth
+from leafflow_ti.synthetic.plane import PlaneScene, render, render_image, truth
 
 SCENE = PlaneScene(
     f_px=1500.0,

@@ -18,7 +18,8 @@ from leafflow_ti.errors import ConfigError
 from leafflow_ti.filters import filter_set
 from leafflow_ti.models import MODELS, column_set
 from leafflow_ti.stages.thresholds import DENOISE
-from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene, render
+from leafflow_ti.synthetic.material import BrightnessTerm
+from leafflow_ti.synthetic.plane import PlaneScene, render
 
 GRID = {"reference": "single", "line": "line-x", "grid": "square"}
 COMBINATIONS = [

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from leafflow_ti.errors import UsageError
 from leafflow_ti.synthetic.exact_flow import optical_flow
 from leafflow_ti.synthetic.geometry import plane_axes, rotation_matrix, tangent_axes
+from leafflow_ti.synthetic.material import BrightnessTerm
 from leafflow_ti.synthetic.plane import (
-    BrightnessTerm,
     PlaneScene,
     noise_scene,
     render,

@@ -15,9 +15,11 @@ from leafflow_ti.capture import open_capture
 from leafflow_ti.cli.main import main
 from leafflow_ti.errors import RunError, UsageError
 from leafflow_ti.metrics import read_truth
-from leafflow_ti.synthetic import cube, leaves, plane
+from leafflow_ti.synthetic import cube, leaf, leaves, plane
 from leafflow_ti.synthetic.cube import CubeScene
+from leafflow_ti.synthetic.leaf import LeafScene
 from leafflow_ti.synthetic.leaves import LeavesScene
+from leafflow_ti.synthetic.material import BrightnessTerm
 from leafflow_ti.synthetic.plane import PlaneScene, sinusoid_scene
 from leafflow_ti.synthetic.write import image_pattern, write_scene
 
@@ -158,7 +160,7 @@ def test_simulate_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         wavelengths_mm=(2.0, 2.0),
         alpha=np.pi / 6,
         beta=np.pi / 4,
-        brightness=(plane.BrightnessTerm("t", 1, 0.01), plane.BrightnessTerm("sx", 2, 0.02, 0.03, 0.04)),
+        brightness=(BrightnessTerm("t", 1, 0.01), BrightnessTerm("sx", 2, 0.02, 0.03, 0.04)),
         growth=plane.linear_growth(0.5),
         strain=(0.001, -0.001, 0.002),
         supersampling=2,
@@ -214,6 +216,62 @@ def test_simulate_cube(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stored_truth["growth_rate"], np.where(stored_truth["face"] > 0, 0.0, np.nan))
 
 
+def test_simulate_leaf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "l"
+    options = (
+        "--cameras 2 --frames 3 --size 60x50 --focal-px 700 --baseline-mm 4 --centre-mm .5,1 --depth-mm 90 "
+        "--slope-x .1 --slope-y -.3 --turn-deg 30 --curvature .02,-.03 --half-mm 3,2 --pointed --velocity .1,0,.2 "
+        "--omega-deg 1,2,3 --rotation-centre-mm 0,1,95 --acceleration .01,0,0 --growth .1,0 "
+        "--brightness t,1,.01,.02,0 --offset 100 --contrast 20 --background 9 --wavelength-mm 1,5 "
+        "--texture-seed 4 --supersampling 2 --interval-s 60"
+    )
+    assert command("simulate", "leaf", out, *options.split()) == 0
+    assert "--preshift -31,0" in capsys.readouterr().out
+    scene = LeafScene(
+        n_cols=2,
+        n_frames=3,
+        size=(60, 50),
+        f_px=700.0,
+        baseline_mm=(4.0, 4.0),
+        centre=(0.5, 1.0, 90.0),
+        zx=0.1,
+        zy=-0.3,
+        turn=np.radians(30.0),
+        curvature=(0.02, -0.03, 0.0),
+        half_mm=(3.0, 2.0),
+        pointed=True,
+        velocity=(0.1, 0.0, 0.2),
+        omega=tuple(np.radians([1.0, 2.0, 3.0]).tolist()),
+        rotation_centre=(0.0, 1.0, 95.0),
+        acceleration=(0.01, 0.0, 0.0),
+        growth=(0.001, 0.0, 0.0),
+        brightness=(BrightnessTerm("t", 1, 0.01, 0.02, 0.0),),
+        offset=100.0,
+        contrast=20.0,
+        background=9.0,
+        wavelengths_mm=(1.0, 5.0),
+        texture_seed=4,
+        supersampling=2,
+    )
+    np.testing.assert_array_equal(tifffile.imread(out / "cam_01" / "frame_002.tif"), leaf.render_image(scene, 2, 0, 1))
+    labels = tifffile.imread(out / "labels.tif")
+    assert labels.dtype == np.uint8
+    np.testing.assert_array_equal(labels, truth_of(out)["region"])
+    assert 100 < np.count_nonzero(labels == 1) < labels.size
+    assert open_capture(out).frame_interval_s == 60.0
+
+
+@pytest.mark.parametrize(("text", "growth"), [("0.1", 3 * (plane.linear_growth(0.1),)), ("0.2,0.1", (2e-3, 1e-3, 0.0))])
+def test_growth_of_a_leaf(text: str, growth: tuple[float, ...], tmp_path: Path) -> None:
+    small = ["--size", "40x30", "--cameras", "1", "--frames", "1", "--supersampling", "1"]
+    assert command("simulate", "leaf", tmp_path / "l", *small, "--growth", text) == 0
+    scene = LeafScene(size=(40, 30), n_cols=1, n_frames=1, growth=growth)  # type: ignore[arg-type]
+    stored = truth_of(tmp_path / "l")
+    assert read_truth(tmp_path / "l" / "truth.npz")["strain_rate"].shape == (30, 40, 3)
+    for name, values in leaf.truth(scene).items():
+        np.testing.assert_array_equal(stored[name], values, err_msg=name)
+
+
 def test_simulate_leaves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "l"
     options = (
@@ -264,6 +322,8 @@ def test_simulate_leaves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         (["plane", "--strain", "1,2"], "--strain 1,2: 3 numbers"),
         (["plane", "--texture", "dots"], "texture 'dots'"),
         (["cube", "--light", "moon"], "light 'moon'"),
+        (["leaf", "--growth", "1,2,3"], "--growth 1,2,3: 1 or 2 numbers"),
+        (["leaf", "--curvature", "1"], "--curvature 1: 2 or 3 numbers"),
         (["cube", "--frames", "0"], "n_frames = 0"),
     ],
 )

@@ -58,7 +58,7 @@ def _bits(option: str, text: str) -> int | None:
 
 
 def _brightness(option: str, texts: list[str]) -> tuple[Any, ...]:
-    from leafflow_ti.synthetic.plane import BrightnessTerm
+    from leafflow_ti.synthetic.material import BrightnessTerm
 
     terms = []
     for text in texts:
@@ -79,6 +79,19 @@ def _growth(option: str, percent: float) -> float:
     from leafflow_ti.synthetic.plane import linear_growth
 
     return linear_growth(percent)
+
+
+def _leaf_growth(option: str, text: str) -> tuple[float, ...]:
+    """``area``, or ``along,across``, in %/frame."""
+    from leafflow_ti.synthetic.leaf import isotropic
+
+    values = numbers(1, 2)(option, text)
+    return isotropic(values[0]) if len(values) == 1 else (values[0] / 100.0, values[1] / 100.0, 0.0)
+
+
+def _curvature(option: str, text: str) -> tuple[float, ...]:
+    """``along,across`` without a twist, or with it."""
+    return (*numbers(2, 3)(option, text), 0.0)[:3]
 
 
 FIELDS: dict[str, tuple[str, Callable[[str, Any], Any]]] = {
@@ -120,6 +133,12 @@ FIELDS: dict[str, tuple[str, Callable[[str, Any], Any]]] = {
     "light_target_mm": ("light_target_mm", numbers(3)),
     "light_cone_deg": ("light_cone", _degrees),
     "ambient_share": ("ambient_share", _keep),
+    # leaf
+    "turn_deg": ("turn", _degrees),
+    "curvature": ("curvature", _curvature),
+    "half_mm": ("half_mm", _pair),
+    "pointed": ("pointed", _keep),
+    "leaf_growth": ("growth", _leaf_growth),
     # leaves
     "leaves": ("leaves", _keep),
     "disparity_px": ("disparity_px", numbers(2)),

@@ -55,6 +55,15 @@ Omega = Annotated[
 Pivot = Annotated[str | None, _option("rotation-centre-mm", "X,Y,Z", "Rotation centre, mm [centre of the object].")]
 Acceleration = Annotated[str | None, _option("acceleration", "X,Y,Z", "Acceleration of that point, mm/frame² [0,0,0].")]
 TextureSeed = Annotated[int | None, _option("texture-seed", "N", "Seed of a noise texture [1].")]
+Brightness = Annotated[
+    list[str] | None,
+    _option(
+        "brightness",
+        "AXIS,POWER,G[,GX,GY]",
+        "Term (G + GX X + GY Y) AXIS^POWER of the logarithm of the brightness: AXIS is t (frames), sx or sy (mm); "
+        "X, Y are mm from the centre. May be repeated.",
+    ),
+]
 Offset = Annotated[float | None, _option("offset", "GREY", "Mean grey value, of 8 bits [plane 100, cube 120].")]
 
 
@@ -101,15 +110,7 @@ def plane(
         float | None, _option("alpha-deg", "DEG", "Turns the texture, or its first cosine, in the plane [0].")
     ] = None,
     beta_deg: Annotated[float | None, _option("beta-deg", "DEG", "Turns the second cosine [as --alpha-deg].")] = None,
-    brightness: Annotated[
-        list[str] | None,
-        _option(
-            "brightness",
-            "AXIS,POWER,G[,GX,GY]",
-            "Term (G + GX X + GY Y) AXIS^POWER of the logarithm of the brightness: AXIS is t (frames), sx or sy (mm); "
-            "X, Y are mm from the centre. May be repeated.",
-        ),
-    ] = None,
+    brightness: Brightness = None,
     growth: Annotated[
         float | None, _option("growth", "PERCENT", "Growth of its area about the centre, %/frame [0].")
     ] = None,
@@ -126,7 +127,7 @@ def plane(
     """A moving plane with a cosine or noise texture; by default the sinusoid of Schuchert 2010, section 5.3."""
     from leafflow_ti.synthetic.plane import noise_scene, sinusoid_scene
 
-    _write(noise_scene() if texture == "noise" else sinusoid_scene(), context.params)
+    _write(noise_scene() if texture == "noise" else sinusoid_scene(), context)
 
 
 @app.command("cube", short_help="A textured box that turns and moves.", no_args_is_help=False)
@@ -186,7 +187,74 @@ def cube(
     """
     from leafflow_ti.synthetic.cube import CubeScene
 
-    _write(CubeScene(), context.params)
+    _write(CubeScene(), context)
+
+
+@app.command("leaf", short_help="A curved leaf that grows, moves and tilts.", no_args_is_help=False)
+def leaf(
+    context: typer.Context,
+    folder: Folder,
+    cameras: Cameras = None,
+    rows: Rows = None,
+    frames: Frames = None,
+    size: Annotated[str, _option("size", "WxH", "Image size in pixels [481x321].")] = "481x321",
+    noise: Noise = None,
+    seed: Seed = None,
+    bits: Bits = "8",
+    interval_s: Interval = None,
+    focal_px: Annotated[float | None, _option("focal-px", "PX", "Focal length in pixels [5681.8].")] = None,
+    principal_px: Principal = None,
+    baseline_mm: Annotated[str | None, _option("baseline-mm", "X[,Y]", "Camera step in mm [1].")] = None,
+    centre_mm: Annotated[
+        str | None, _option("centre-mm", "X,Y", "Centre of the leaf at the middle frame, mm [0,0].")
+    ] = None,
+    depth_mm: Annotated[float | None, _option("depth-mm", "Z", "Depth of that centre, mm [250].")] = None,
+    slope_x: Annotated[float | None, _option("slope-x", "ZX", "Slope dZ/dX at the centre [0.3].")] = None,
+    slope_y: Annotated[float | None, _option("slope-y", "ZY", "Slope dZ/dY at the centre [-0.2].")] = None,
+    turn_deg: Annotated[
+        float | None, _option("turn-deg", "DEG", "Direction of the long axis in the leaf, from above X [23].")
+    ] = None,
+    curvature: Annotated[
+        str | None,
+        _option("curvature", "ALONG,ACROSS[,TWIST]", "Curvatures along both axes and between, 1/mm [-.012,.025,.006]."),
+    ] = None,
+    half_mm: Annotated[str | None, _option("half-mm", "L[,W]", "Half the length and the width, mm [5.6,4].")] = None,
+    pointed: Annotated[
+        bool | None, _option("pointed/--ellipse", "", "Outline with tips at both ends, or without [ellipse].")
+    ] = None,
+    velocity: Annotated[
+        str | None, _option("velocity", "X,Y,Z", "Velocity of the rotation centre, mm/frame [.04,-.03,.05].")
+    ] = None,
+    omega_deg: Annotated[
+        str | None, _option("omega-deg", "X,Y,Z", "Rotation, axis times degrees per frame [.14,.22,.14].")
+    ] = None,
+    rotation_centre_mm: Pivot = None,
+    acceleration: Acceleration = None,
+    leaf_growth: Annotated[
+        str | None,
+        _option(
+            "growth",
+            "AREA|ALONG,ACROSS",
+            "Growth of the area, alike in all directions, or of lengths along the long axis and across, %/frame [.1].",
+        ),
+    ] = None,
+    brightness: Brightness = None,
+    offset: Annotated[float | None, _option("offset", "GREY", "Mean grey value, of 8 bits [120].")] = None,
+    contrast: Annotated[float | None, _option("contrast", "GREY", "Standard deviation of the texture [27].")] = None,
+    background: Annotated[float | None, _option("background", "GREY", "Grey value beside the leaf [20].")] = None,
+    wavelength_mm: Annotated[
+        str | None, _option("wavelength-mm", "MIN,MAX", "Wavelengths of the texture, mm [.3,1.2].")
+    ] = None,
+    texture_seed: TextureSeed = None,
+    supersampling: Annotated[int | None, _option("supersampling", "N", "Rays per pixel: N x N [4].")] = None,
+) -> None:
+    """A curved leaf that grows while it moves, tilts and changes its brightness.
+
+    truth.npz labels it as region 1; labels.tif is the same as an image.
+    """
+    from leafflow_ti.synthetic.leaf import LeafScene
+
+    _write(LeafScene(), context)
 
 
 @app.command("leaves", short_help="Leaves at several depths over a ground, each moving.", no_args_is_help=False)
@@ -238,15 +306,16 @@ def leaves(
     """
     from leafflow_ti.synthetic.leaves import LeavesScene
 
-    _write(LeavesScene(), context.params)
+    _write(LeavesScene(), context)
 
 
-def _write(default: Scene, params: Mapping[str, Any]) -> None:
+def _write(default: Scene, context: typer.Context) -> None:
     """Write the scene ``default``, changed by the options that were given."""
     from leafflow_ti.synthetic.write import write_scene
 
-    given = {name: value for name, value in params.items() if value not in (None, [], ())}
-    changes = {FIELDS[name][0]: FIELDS[name][1](_flag(name), given[name]) for name in given if name in FIELDS}
+    flags = {str(option.name): option.opts[0] for option in context.command.params}
+    given = {name: value for name, value in context.params.items() if value not in (None, [], ())}
+    changes = {FIELDS[name][0]: FIELDS[name][1](flags[name], given[name]) for name in given if name in FIELDS}
     if "centre_mm" in given or "depth_mm" in given:
         changes["centre"] = _centre(default, given)
     scene = replace(default, **changes)
@@ -279,10 +348,6 @@ def _whole_disparity(scene: Scene) -> tuple[int, int]:
     counts = (scene.n_cols, scene.n_rows)
     nx, ny = (round(-scene.f_px * b / centre[2]) * (n > 1) for b, n in zip(scene.baseline_mm, counts, strict=True))
     return nx, ny
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 def _show_progress(done: int, total: int) -> None:

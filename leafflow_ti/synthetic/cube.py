@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.errors import UsageError
 from leafflow_ti.synthetic.geometry import Array, rotation_matrix
+from leafflow_ti.synthetic.material import no_growth
 from leafflow_ti.synthetic.motion import RigidScene
 from leafflow_ti.synthetic.noise_texture import albedo, noise_texture
 from leafflow_ti.synthetic.rig import Vector, render_grid
@@ -138,8 +139,9 @@ def truth(scene: CubeScene) -> dict[str, Array]:
     """What the middle camera sees at the middle frame, at the pixel centres; NaN beside the box.
 
     ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] mm/frame and ``acceleration`` [H, W, 3] mm/frame² of
-    the point seen; ``flow`` [H, W, 2] px/frame; ``omega`` [3] rad/frame; ``growth_rate`` [H, W], none: 0 %/frame;
-    ``face`` [H, W] integer label, 0 beside the box (see FACES).
+    the point seen; ``flow`` [H, W, 2] px/frame; ``omega`` [3] rad/frame; ``growth_rate`` [H, W],
+    ``strain_rate`` and ``surface_strain`` [H, W, 3], none: 0 %/frame; ``face`` [H, W] integer label, 0 beside the box
+    (see FACES).
     """
     camera = np.zeros(3)
     x, y = scene.ray_axes()
@@ -161,7 +163,7 @@ def truth(scene: CubeScene) -> dict[str, Array]:
         "omega": np.array(scene.omega),
         "acceleration": acceleration,
         "flow": scene.image_motion(points, velocity),
-        "growth_rate": np.where(face > 0, 0.0, np.nan),
+        **no_growth(face > 0),
         "face": face,
     }
 

@@ -35,13 +35,15 @@ def plane_axes(zx: float, zy: float) -> Array:
     return np.asarray(np.eye(3) + k + k @ k / (1.0 + normal[2]))
 
 
-def tangent_axes(zx: float, zy: float) -> Array:
-    """Orthonormal tangents of the plane ``Z = ZX X + ZY Y`` as columns, [3, 2]: e1 above the X axis, e2 at y > 0.
+def tangent_axes(zx: ArrayLike, zy: ArrayLike) -> Array:
+    """Orthonormal tangents of the planes ``Z = ZX X + ZY Y`` as columns, [..., 3, 2]: e1 above the X axis, e2 at y > 0.
 
     ``e1 = (1, 0, ZX)/norm`` and ``e2 = n × e1`` with the normal ``n`` of ``plane_axes``: the axes of strain rates.
     """
-    e1 = np.array([1.0, 0.0, zx]) / np.sqrt(1.0 + zx * zx)
-    return np.stack([e1, np.cross(plane_axes(zx, zy)[:, 2], e1)], axis=1)
+    zx, zy = np.broadcast_arrays(np.asarray(zx, np.float64), np.asarray(zy, np.float64))
+    along = np.stack([np.ones_like(zx), np.zeros_like(zx), zx], axis=-1)
+    across = np.stack([-zx * zy, 1.0 + zx * zx, zy], axis=-1)  # (-ZX, -ZY, 1) x (1, 0, ZX), but for lengths
+    return np.stack([v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (along, across)], axis=-1)
 
 
 def in_plane(zx: float, zy: float, rates: ArrayLike) -> Array:
@@ -50,3 +52,13 @@ def in_plane(zx: float, zy: float, rates: ArrayLike) -> Array:
     axes = tangent_axes(zx, zy)
     r11, r22, r12 = np.asarray(rates, dtype=np.float64)
     return np.asarray(axes @ np.array([[r11, r12], [r12, r22]]) @ axes.T)
+
+
+def within_outline(along: Array, across: Array, pointed: bool) -> NDArray[np.bool_]:
+    """Which places of a leaf's surface [...] belong to it, in half lengths and half widths from its middle.
+
+    ``pointed``: two parabolas that meet in tips at both ends, else an ellipse.
+    """
+    if pointed:
+        return np.asarray(np.abs(across) <= 1.0 - along**2)
+    return np.asarray(along**2 + across**2 <= 1.0)

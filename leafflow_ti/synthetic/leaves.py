@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.errors import UsageError
-from leafflow_ti.synthetic.geometry import Array, plane_axes
+from leafflow_ti.synthetic.geometry import Array, plane_axes, within_outline
+from leafflow_ti.synthetic.material import no_growth
 from leafflow_ti.synthetic.plane import PlaneScene
 from leafflow_ti.synthetic.rig import CameraGrid, rays_of, render_grid
 
@@ -50,9 +51,7 @@ class Leaf:
         p, q = pq[..., 0], pq[..., 1]
         along = (math.cos(self.turn) * p + math.sin(self.turn) * q) / self.half[0]
         across = (math.cos(self.turn) * q - math.sin(self.turn) * p) / self.half[1]
-        if self.pointed:
-            return np.asarray(np.abs(across) <= 1.0 - along**2)
-        return np.asarray(along**2 + across**2 <= 1.0)
+        return within_outline(along, across, self.pointed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,8 +211,8 @@ def truth(scene: LeavesScene) -> dict[str, Any]:
     """What the middle camera sees at the middle frame, at the pixel centres.
 
     ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` mm/frame, ``omega`` rad/frame and ``acceleration`` mm/frame²
-    [H, W, 3] of the point seen; ``flow`` [H, W, 2] px/frame; ``growth_rate`` [H, W], none: 0 %/frame; ``face`` [H, W]
-    label, 0 on the ground, leaves from 1.
+    [H, W, 3] of the point seen; ``flow`` [H, W, 2] px/frame; ``growth_rate`` [H, W], ``strain_rate`` and
+    ``surface_strain`` [H, W, 3], none: 0 %/frame; ``face`` [H, W] label, 0 on the ground, leaves from 1.
     """
     label, points = scene.trace(scene.rays(), np.zeros(3), 0.0)
     zx, zy = np.empty(label.shape), np.empty(label.shape)
@@ -230,6 +229,6 @@ def truth(scene: LeavesScene) -> dict[str, Any]:
         "omega": omega,
         "acceleration": acceleration,
         "flow": scene.surfaces[GROUND].image_motion(points, velocity),
-        "growth_rate": np.zeros(label.shape),
+        **no_growth(np.ones(label.shape, np.bool_)),
         "face": label,
     }

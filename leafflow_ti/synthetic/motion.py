@@ -46,6 +46,11 @@ class RigidScene(CameraGrid):
         moved = self.pivot + t * np.array(self.velocity) + 0.5 * t * t * np.array(self.acceleration)
         return rotation, moved - rotation @ self.pivot
 
+    def follow(self, points: Array, t: float, start: float = 0.0) -> Array:
+        """Where what is at the world points [..., 3] of the object at ``start`` is at ``t`` (both in frames)."""
+        (before, shift), (rotation, moved) = self.pose(start), self.pose(t)
+        return np.asarray((points - shift) @ before @ rotation.T + moved)
+
     def point_motion(self, points: Array) -> tuple[Array, Array]:
         """Velocity ``N + Ω × (X - Xr)`` and acceleration ``A + Ω × (Ω × (X - Xr))`` at t = 0 of points [..., 3]."""
         omega = np.array(self.omega)

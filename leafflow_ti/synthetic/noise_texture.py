@@ -19,6 +19,9 @@ MAX_TABLE = 8192
 MOST_FIELDS = 24
 """Fields that are kept: those of all surfaces of a scene, which are read in turn."""
 
+PERIOD = 64
+"""After so many of its shortest wavelengths the noise of a surface without borders repeats itself."""
+
 DARKEST = 1.0
 """Lowest albedo in grey values: no point of a surface is black, logarithms of the images stay finite."""
 
@@ -68,6 +71,15 @@ def albedo(
 ) -> NDArray[np.float64]:
     """Grey values [m] under full light of a texture with mean ``offset`` and standard deviation ``contrast``."""
     return np.maximum(offset + contrast * sample(field, period, u, v), DARKEST)
+
+
+def noise_albedo(
+    seed: tuple[int, ...], wavelengths: tuple[float, float], u: Array, v: Array, offset: float, contrast: float
+) -> NDArray[np.float64]:
+    """``albedo`` of noise with the shortest and the longest of ``wavelengths`` that goes on for ever."""
+    shortest, longest = wavelengths
+    period = max(PERIOD * shortest, 4.0 * longest)
+    return albedo(noise_texture(seed, period, shortest, longest), period, u, v, offset, contrast)
 
 
 def _cell(position: Array, period: float, n: int) -> tuple[NDArray[np.intp], Array]:

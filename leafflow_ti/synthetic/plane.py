@@ -24,41 +24,15 @@ import numpy as np
 
 from leafflow_ti.errors import UsageError
 from leafflow_ti.synthetic.geometry import Array, in_plane, plane_axes
-from leafflow_ti.synthetic.motion import RigidScene
-from leafflow_ti.synthetic.noise_texture import albedo, noise_texture
+from leafflow_ti.synthetic.material import MaterialScene, growth_maps
+from leafflow_ti.synthetic.noise_texture import noise_albedo
 from leafflow_ti.synthetic.rig import Vector, rays_of, render_grid
 
 Texture = Literal["waves", "noise"]
 
-NOISE_PERIOD = 64
-"""After so many of its shortest wavelengths a noise texture repeats itself."""
-
-
-@dataclass(frozen=True)
-class BrightnessTerm:
-    """One term ``(g + gx ΔX + gy ΔY) m^power`` of ``h`` (Schuchert 2010, Eqs. (4.15), (4.27), section 6.1).
-
-    ``m`` is ``t`` [frames] or the camera position ``sx``, ``sy`` [mm]; (ΔX, ΔY) [mm] is where the material point lies
-    at t = 0, relative to the patch centre. ``g`` is in 1/m^power, ``gx``, ``gy`` per mm of that.
-    """
-
-    axis: Literal["t", "sx", "sy"]
-    power: int
-    g: float
-    gx: float = 0.0
-    gy: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.axis not in ("t", "sx", "sy"):
-            raise UsageError(f"brightness axis '{self.axis}': choose t, sx or sy")
-        if self.power < 1:
-            raise UsageError(f"brightness power {self.power}: at least 1 (a constant factor belongs to the texture)")
-        if not np.isfinite((self.g, self.gx, self.gy)).all():
-            raise UsageError(f"brightness coefficients {self.g}, {self.gx}, {self.gy}: all must be finite")
-
 
 @dataclass(frozen=True, kw_only=True)
-class PlaneScene(RigidScene):
+class PlaneScene(MaterialScene):
     """The plane ``Z = Z0 + ZX (X - X0) + ZY (Y - Y0)`` and its texture; motion and cameras are inherited.
 
     ``alpha``, ``beta`` in rad (``beta`` None: equal to ``alpha``): of waves. ``offset`` and ``amplitude``: mean and
@@ -78,22 +52,13 @@ class PlaneScene(RigidScene):
     wavelengths_mm: tuple[float, float] = (0.3, 0.3)
     alpha: float = 0.0
     beta: float | None = None
-    brightness: tuple[BrightnessTerm, ...] = ()
     growth: float = 0.0
     strain: Vector = (0.0, 0.0, 0.0)
     texture: Texture = "waves"
-    texture_seed: int = 1
     supersampling: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        ends = (self.time(0), self.time(self.n_frames - 1), -0.5, 0.5)
-        lengths = [np.linalg.eigvalsh(self.deformation(t)).min() for t in ends]
-        if min(lengths) <= 0.0:
-            raise UsageError(
-                f"growth = {self.growth:g}, strain = {self.strain} per frame: the plane would vanish within the "
-                f"{self.n_frames} frames: choose less"
-            )
         if min(self.wavelengths_mm) <= 0.0:
             raise UsageError(f"wavelengths {self.wavelengths_mm} mm: both must be positive")
         if self.texture not in get_args(Texture):
@@ -102,8 +67,6 @@ class PlaneScene(RigidScene):
             raise UsageError(f"wavelengths {self.wavelengths_mm} mm of noise: give the shortest, then the longest")
         if self.supersampling is not None and self.supersampling < 1:
             raise UsageError(f"supersampling = {self.supersampling}: at least 1 sample per pixel and axis is needed")
-        if self.texture_seed < 0:
-            raise UsageError(f"texture_seed = {self.texture_seed}: a seed cannot be negative")
 
     @property
     def rays_per_axis(self) -> int:
@@ -132,53 +95,27 @@ class PlaneScene(RigidScene):
         """All in-plane strain rates (11, 22, 12) [3] along ``tangent_axes``, 1/frame: ``growth`` and ``strain``."""
         return np.asarray(self.growth * np.array([1.0, 1.0, 0.0]) + np.array(self.strain))
 
-    def deformation(self, t: float) -> Array:
-        """The matrix ``1 + t E`` [3, 3] that takes offsets in the plane at t = 0 to those at ``t`` frames, unturned."""
-        return np.eye(3) + t * in_plane(self.zx, self.zy, self.strain_rates)
+    @property
+    def expansion(self) -> Array:
+        """See ``MaterialScene``; none along the normal."""
+        return in_plane(self.zx, self.zy, self.strain_rates)
 
     @property
     def growth_rate(self) -> float:
         """Growth of the area between half a frame before and after t = 0, in %/frame."""
-        before, after = (float(np.linalg.det(self.deformation(t))) for t in (-0.5, 0.5))
-        return 100.0 * (after / before - 1.0)
-
-    def place(self, offsets: Array, t: float) -> Array:
-        """Where the material points ``offsets`` [..., 3] (see ``material``) are at time ``t``, in the world."""
-        rotation, shift = self.pose(t)
-        return np.asarray((np.array(self.centre) + offsets @ self.deformation(t)) @ rotation.T + shift)
-
-    def material(self, points: Array, t: float) -> Array:
-        """Where the material points now at ``points`` [..., 3] were at t = 0, relative to the patch centre [mm]."""
-        rotation, shift = self.pose(t)
-        return np.asarray(((points - shift) @ rotation - np.array(self.centre)) @ np.linalg.inv(self.deformation(t)))
-
-    def point_motion(self, points: Array) -> tuple[Array, Array]:
-        """Velocity and acceleration at t = 0 of the material at points [..., 3] of the plane, growth included."""
-        velocity, acceleration = super().point_motion(points)
-        spreading = (points - np.array(self.centre)) @ in_plane(self.zx, self.zy, self.strain_rates)
-        return velocity + spreading, acceleration + 2.0 * np.cross(np.array(self.omega), spreading)
+        return float(growth_maps(np.array(self.zx), np.array(self.zy), self.expansion)["growth_rate"])
 
     def albedo(self, offsets: Array) -> Array:
         """Grey values [...] of the material points ``offsets`` [..., 3], without brightness changes."""
         pq = offsets @ plane_axes(self.zx, self.zy)
         if self.texture == "noise":
-            shortest, longest = self.wavelengths_mm
-            period = max(NOISE_PERIOD * shortest, 4.0 * longest)
-            field = noise_texture((self.texture_seed,), period, shortest, longest)
-            return albedo(field, period, pq[..., 0], pq[..., 1], self.offset, self.amplitude)
+            u, v = pq[..., 0], pq[..., 1]
+            return noise_albedo((self.texture_seed,), self.wavelengths_mm, u, v, self.offset, self.amplitude)
         beta = self.alpha if self.beta is None else self.beta
         first = math.cos(self.alpha) * pq[..., 0] + math.sin(self.alpha) * pq[..., 1]
         second = math.cos(beta) * pq[..., 1] - math.sin(beta) * pq[..., 0]
         k1, k2 = (2.0 * math.pi / wavelength for wavelength in self.wavelengths_mm)
         return np.asarray(self.offset + self.amplitude * np.cos(k1 * first) * np.cos(k2 * second))
-
-    def log_brightness(self, offsets: Array, camera: Array, t: float) -> Array:
-        """The exponent ``h`` [...] at the material points ``offsets`` [..., 3]."""
-        h = np.zeros(offsets.shape[:-1])
-        where = {"t": t, "sx": float(camera[0]), "sy": float(camera[1])}
-        for term in self.brightness:
-            h += (term.g + term.gx * offsets[..., 0] + term.gy * offsets[..., 1]) * where[term.axis] ** term.power
-        return h
 
 
 def render_image(scene: PlaneScene, frame: int, row: int, col: int) -> Array:
@@ -210,11 +147,12 @@ def truth(scene: PlaneScene) -> dict[str, Array]:
 
     ``depth`` [mm], ``zx``, ``zy`` [H, W]; ``velocity`` [H, W, 3] = N + Ω × (X - Xr) + E (X - Xc) mm/frame, of the point
     seen at the pixel; ``omega`` [3] rad/frame; ``acceleration`` [H, W, 3] = A + Ω × (Ω × (X - Xr)) + 2 Ω × E (X - Xc)
-    mm/frame²; ``flow`` [H, W, 2] px/frame; ``growth_rate`` [H, W] %/frame, of the area; ``strain_rate`` [H, W, 3]
-    %/frame, of lengths: 11, 22 and 12 along ``tangent_axes``.
+    mm/frame²; ``flow`` [H, W, 2] px/frame; ``growth_rate`` [H, W], ``strain_rate`` and ``surface_strain`` [H, W, 3]
+    %/frame as of ``growth_maps``.
     """
     points = scene.intersect(scene.rays(), np.zeros(3), 0.0)
     velocity, acceleration = scene.point_motion(points)
+    growth = growth_maps(np.array(scene.zx), np.array(scene.zy), scene.expansion)
     return {
         "depth": points[..., 2],
         "zx": np.full(points.shape[:2], scene.zx),
@@ -223,8 +161,7 @@ def truth(scene: PlaneScene) -> dict[str, Array]:
         "omega": np.array(scene.omega),
         "acceleration": acceleration,
         "flow": scene.image_motion(points, velocity),
-        "growth_rate": np.full(points.shape[:2], scene.growth_rate),
-        "strain_rate": np.broadcast_to(100.0 * scene.strain_rates, points.shape).copy(),
+        **{name: np.broadcast_to(value, (*points.shape[:2], *value.shape)).copy() for name, value in growth.items()},
     }
 
 

@@ -94,6 +94,14 @@ class CameraGrid:
         """Viewing rays ``(x/f, y/f, 1)`` through the pixel centres, [H, W, 3]."""
         return rays_of(*self.ray_axes())
 
+    def pixels(self, points: Array, camera: Array | None = None) -> Array:
+        """Where world points [..., 3] are seen: (x, y) [..., 2] in pixels of the image of the camera at ``camera`` [3].
+
+        None: the middle camera.
+        """
+        relative = points - (np.zeros(3) if camera is None else camera)
+        return np.asarray(self.f_px * relative[..., :2] / relative[..., 2:] + np.array(self.principal))
+
     def integrate(self, shade: Callable[[Array, Array], Array], oversampling: int) -> Array:
         """The image [H, W] of ``shade``, averaged over ``oversampling``² rays in each pixel; grey values, unexposed.
 

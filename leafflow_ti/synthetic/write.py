@@ -1,4 +1,5 @@
-"""A scene as files: TIFF images, the ``capture.toml`` that describes them, and the exact truth as ``truth.npz``."""
+"""A scene as files: TIFF images, the ``capture.toml`` that describes them, the exact truth as ``truth.npz``, and the
+regions of its middle frame as ``labels.tif``."""
 
 from __future__ import annotations
 
@@ -18,6 +19,7 @@ from leafflow_ti.synthetic.scene import Scene, render_image, truth
 
 CAPTURE_FILE = "capture.toml"
 TRUTH_FILE = "truth.npz"
+LABELS_FILE = "labels.tif"
 
 
 def write_scene(
@@ -29,7 +31,8 @@ def write_scene(
     """Render ``scene`` into a new or empty ``folder``, which appears under its name only when it is whole.
 
     Images are uint8 or uint16 (10, 12 and 14 bits lie in 16), or float32 for ``bits`` None. ``truth.npz`` holds the
-    maps of ``truth``, the index ``frame`` they belong to, ``f_px``, ``baseline_mm`` and ``principal``.
+    maps of ``truth``, the index ``frame`` they belong to, ``f_px``, ``baseline_mm`` and ``principal``; ``labels.tif``
+    (uint8) its ``region``, of scenes that have one.
     ``interval_s`` [s] is the time between frames; ``progress`` is called with the number of images done and of all.
     Raises UsageError if the folder holds anything, or as rendering does; RunError if it cannot be written.
     """
@@ -41,7 +44,10 @@ def write_scene(
     try:
         scratch.mkdir(parents=True)
         _write_images(scene, scratch, progress)
-        np.savez_compressed(scratch / TRUTH_FILE, **truth_arrays(scene))
+        arrays = truth_arrays(scene)
+        np.savez_compressed(scratch / TRUTH_FILE, **arrays)
+        if "region" in arrays:
+            tifffile.imwrite(scratch / LABELS_FILE, arrays["region"].astype(np.uint8))
         (scratch / CAPTURE_FILE).write_text(capture_text(scene, interval_s), encoding="utf-8")
         if folder.exists():
             folder.rmdir()

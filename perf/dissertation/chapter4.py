@@ -7,7 +7,8 @@ from itertools import product
 from typing import Any
 
 from leafflow_ti.synthetic.cube import CubeScene
-from leafflow_ti.synthetic.plane import BrightnessTerm, PlaneScene
+from leafflow_ti.synthetic.material import BrightnessTerm
+from leafflow_ti.synthetic.plane import PlaneScene
 from perf.dissertation.experiment import Diagram, Experiment, Panel, Point, Printed, Table, Variant, diagrams
 from perf.dissertation.scenes import middle, sinusoid
 

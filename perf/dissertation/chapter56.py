@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from leafflow_ti.synthetic.cube import CubeScene
-from leafflow_ti.synthetic.plane import BrightnessTerm
+from leafflow_ti.synthetic.material import BrightnessTerm
 from perf.dissertation.chapter4 import CUBE_VIEW, N_LEFT, N_RIGHT, RGR_LEFT, RGR_RIGHT, SIZE
 from perf.dissertation.chapter4 import FACE_COLUMNS as GROWTH_COLUMNS
 from perf.dissertation.experiment import Diagram, Experiment, Panel, Point, Printed, Table, Variant, diagrams

@@ -1,0 +1,153 @@
+"""Results in the formats of other programs: one table of formats, one file of code each.
+
+A format's writer takes a ``Selection`` and a path that does not exist yet (a folder does, empty) and returns what it
+wrote. It reads one frame at a time, so that memory does not grow with the sequence.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol, cast
+
+from leafflow_ti.errors import InputError, RunError, UsageError
+from leafflow_ti.exporters.selection import Selection
+from leafflow_ti.results import ResultStore
+
+Writer = Callable[[Selection, Path], list[Path]]
+
+
+class _Count(Protocol):
+    def __call__(self, selection: Selection) -> int: ...
+
+
+def _one(selection: Selection) -> int:
+    return 1
+
+
+def _frames(selection: Selection) -> int:
+    return len(selection.indices)
+
+
+def _maps(selection: Selection) -> int:
+    return len(selection.all_names)
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format. ``suffixes``: of its files; ``file``, ``folder``: its writers, as ``module:function`` of this package,
+    into one file and into a folder; ``parts``: how many files one file stands for, which it can only if that is 1;
+    ``surface``: needs a depth; ``about``: a line for the help."""
+
+    suffixes: tuple[str, ...]
+    file: str | None
+    folder: str | None
+    parts: _Count
+    surface: bool
+    about: str
+
+
+FORMATS: dict[str, Format] = {
+    "tiff": Format((".tif", ".tiff"), "tiff:write_imagej_file", "tiff:write_imagej_folder", _maps, False,
+                   "ImageJ and Fiji: a float32 stack per map"),
+    "ome-tiff": Format((".tif", ".tiff"), "tiff:write_ome", None, _one, False,
+                       "Bio-Formats, napari: one file, maps as channels"),
+    "netcdf": Format((".nc",), "netcdf:write_netcdf", None, _one, False,
+                     "CF conventions: MATLAB, R, Panoply, xarray"),
+    "ply": Format((".ply",), "ply:write_ply_file", "ply:write_ply_folder", _frames, True,
+                  "MeshLab, CloudCompare, Blender: a mesh per frame"),
+    "vtk": Format((".vtp",), "vtk:write_vtk_file", "vtk:write_vtk_folder", _frames, True,
+                  "ParaView: a series of meshes with vectors"),
+    "csv": Format((".csv",), "text:write_csv_file", "text:write_csv_folder", _one, False,
+                  "a line per pixel: R, pandas; a folder gets a file per frame"),
+}  # fmt: skip
+"""Name -> format."""
+
+
+def export(
+    store: ResultStore | str | Path,
+    to: str,
+    path: str | Path,
+    *,
+    frames: str | None = None,
+    maps: Sequence[str] | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write results in the format ``to``, one of ``FORMATS``; return the files.
+
+    ``path``: a file, by its suffix, or a folder for formats of several files. ``frames``: ``"A:B"``, indices of
+    frames, B excluded; ``maps``: names or patterns such as ``"velocity_*"``, ``"status"`` among them; None: all.
+    ``overwrite`` replaces a file, or a folder that holds files of this format alone. What is written appears under its
+    name when it is whole.
+    Raises UsageError, InputError (no such map or frame, no depth for a mesh), MissingExtra, RunError (an unfinished
+    store, or files that cannot be written).
+    """
+    if to not in FORMATS:
+        raise UsageError(f"no format {to!r}: choose one of {', '.join(FORMATS)}")
+    store, path, kind = store if isinstance(store, ResultStore) else ResultStore.open(store), Path(path), FORMATS[to]
+    selection = Selection.of(store, frames, maps)
+    if kind.surface and "depth" not in store.names:
+        raise InputError(f"{store.path}: has no depth, so no surface for {to}: measure with a camera grid, or take csv")
+    as_file = _as_file(kind, to, path, selection)
+    _check_target(path, as_file, kind, overwrite)
+    writer = _writer(kind.file if as_file else kind.folder)
+    scratch = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not as_file:
+            scratch.mkdir()
+        written = writer(selection, scratch)
+        _remove(path)
+        scratch.rename(path)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written ({error.strerror or error}): mend that, or another path") from error
+    finally:
+        _remove(scratch)
+    return [path / file.relative_to(scratch) for file in written]
+
+
+def _as_file(kind: Format, to: str, path: Path, selection: Selection) -> bool:
+    """Whether ``path`` names one file, by its suffix; UsageError where that cannot be."""
+    if path.suffix.lower() not in kind.suffixes:
+        if kind.folder is None:
+            raise UsageError(f"{path}: {to} is one file: let its name end in {kind.suffixes[0]}")
+        return False
+    if kind.file is None or kind.parts(selection) != 1:
+        raise UsageError(
+            f"{path} is one file, this selection makes {kind.parts(selection)}: give a folder (a name without "
+            f"{path.suffix}), or choose with --frames and --maps"
+        )
+    return True
+
+
+def _check_target(path: Path, as_file: bool, kind: Format, overwrite: bool) -> None:
+    """Refuse to replace what must be kept."""
+    if not path.exists():
+        return
+    if path.is_dir() == as_file:
+        raise UsageError(f"{path} exists and is a {'folder' if as_file else 'file'}: give another name")
+    if as_file and not overwrite:
+        raise UsageError(f"{path} exists: give --overwrite to replace it, or another name")
+    ours = (*kind.suffixes, ".pvd")
+    foreign = [] if as_file else sorted(p.name for p in path.iterdir() if p.is_dir() or p.suffix.lower() not in ours)
+    if foreign:
+        raise UsageError(f"{path} holds something else ({foreign[0]}), so it is not replaced: give another name")
+    if not as_file and not overwrite and any(path.iterdir()):
+        raise UsageError(f"{path} exists: give --overwrite to replace it, or another name")
+
+
+def _writer(place: str | None) -> Writer:
+    assert place is not None
+    module, _, function = place.partition(":")
+    return cast(Writer, getattr(import_module(f"leafflow_ti.exporters.{module}"), function))
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
