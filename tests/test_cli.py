@@ -60,17 +60,9 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     assert all(f"\n  {name} " in text for name in cli.COMMANDS)
     assert set(cli.COMMANDS) == {
-        "simulate",
-        "run",
-        "growth",
-        "evaluate",
-        "profile",
-        "plan-rig",
-        "check",
-        "info",
-        "demo",
-        "report",
-    }
+        "simulate", "run", "growth", "evaluate", "track", "export", "regions", "profile", "check", "plan-rig",
+        "report", "info", "demo",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
