@@ -26,7 +26,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert call("--help") == 0
     text = capsys.readouterr().out
     assert all(f"\n  {name} " in text for name in cli.COMMANDS)
-    measuring, derived = {"run", "evaluate", "profile", "demo"}, {"growth", "regions", "export", "report"}
+    measuring, derived = {"run", "evaluate", "profile", "demo"}, {"growth", "track", "regions", "export", "report"}
     assert set(cli.COMMANDS) == measuring | derived | {"simulate", "plan-rig", "check", "info"}
 
 
