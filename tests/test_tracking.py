@@ -184,7 +184,7 @@ def test_points_are_lost_for_a_reason(tmp_path: Path) -> None:
     coarse = (slice(13, 15), slice(12, 14))
     status[coarse] = Status.COARSE
     maps["depth"][:6, 12:] = 50.0  # another surface, far before the first
-    maps["flow_x_std"][6, :] = 10.0
+    maps["flow_x_std"][6, :] = np.inf  # not determined
     fill(store, maps, status)
     start = [(35.0, 16.0), (21.0, 20.0), (21.0, 28.0), (21.0, 6.0), (5.0, 12.0), (5.0, 16.0), (24.5, 20.0)]
     tracks = track(store, *np.array(start).T)
