@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
-from leafflow_ti.regions import RegionTable, over_frames
+from leafflow_ti.region_table import RegionTable, over_frames
 from leafflow_ti.tables import write_table
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def fold(table: RegionTable, bin_h: float = 1.0, quantity: str = "growth") -> Di
             table[name][own], table[error][own], np.floor(hours[own] / bin_h).astype(int) % n_bins, days[own]
         )
         for at in range(n_bins):
-            found = values.bin(at, table.correlation)
+            found = values.bin(at, table.correlation[quantity])
             if found is not None:
                 rows.append((region, at * bin_h, (at + 1) * bin_h, *found))
     names = ("region", "hour_start", "hour_end", name, error, f"{quantity}_days_sd_percent_per_h", "days", "frames")

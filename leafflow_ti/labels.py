@@ -110,21 +110,30 @@ def cover(
     axes = []
     for positions, low, high in ((store.y, *span[:2]), (store.x, *span[2:])):
         pitch = int(positions[1] - positions[0]) if positions.size > 1 else 1
-        first = int(np.searchsorted(positions, low - pitch // 2))
-        last = int(np.searchsorted(positions, high + pitch // 2, side="right"))
-        axes.append((slice(first, last), np.add.outer(positions[first:last], np.arange(pitch) - (pitch - 1) // 2)))
-    (rows, y), (columns, x) = axes
+        half = pitch // 2
+        first = int(np.searchsorted(positions, low - half))
+        last = int(np.searchsorted(positions, high + half, side="right"))
+        axes.append((slice(first, last), np.add.outer(positions[first:last], np.arange(-half, half + 1)), pitch))
+    (rows, y, pitch_y), (columns, x, pitch_x) = axes
     if not y.size or not x.size:
         return None
     fine = np.meshgrid(y.ravel(), x.ravel(), indexing="ij")
     hits = inside(np.stack([fine[1].ravel(), fine[0].ravel()]).astype(np.float64))
-    share = hits.reshape(*y.shape, *x.shape).mean(axis=(1, 3))
-    return Coverage((rows, columns), share, y.shape[1] * x.shape[1])
+    share = np.einsum("yixj,i,j->yx", hits.reshape(*y.shape, *x.shape), _even(pitch_y), _even(pitch_x))
+    return Coverage((rows, columns), share, pitch_y * pitch_x)
+
+
+def _even(pitch: int) -> NDArray[np.float64]:
+    """Weights of the pixels around an entry of the maps; with an even pitch the outermost lie between two entries."""
+    weights = np.full(2 * (pitch // 2) + 1, 1 / pitch)
+    if pitch % 2 == 0:
+        weights[[0, -1]] /= 2
+    return weights
 
 
 def looked_up(image: LabelImage, points: NDArray[np.float64]) -> LabelImage:
     """Labels [n] at points (x, y) [2, n] px, that of the nearest pixel; 0 beyond the image."""
-    x, y = np.rint(points).astype(np.int64)
+    x, y = np.floor(points + 0.5).astype(np.int64)  # np.rint would take two of four halves
     height, width = image.shape
     known = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     found = np.zeros(x.size, np.int64)

@@ -6,6 +6,7 @@ where a value is missing.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 from collections.abc import Mapping
@@ -73,7 +74,8 @@ def write_table(columns: Columns, path: str | Path, overwrite: bool = False) -> 
     except OSError as error:
         raise RunError(f"{path}: cannot be written ({error.strerror or error}): mend that, or another name") from error
     finally:
-        scratch.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            scratch.unlink(missing_ok=True)
     return path
 
 

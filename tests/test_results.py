@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -81,6 +82,20 @@ def test_written_units_read_back(full: ResultStore) -> None:
     np.testing.assert_array_equal(field["depth"][4:8], expected)
     with pytest.raises(InputError, match="has no map 'flow_x'; it has: depth"):
         full.read("flow_x")
+
+
+def test_times_of_the_frames(full: ResultStore, tmp_path: Path) -> None:
+    assert full.times_s is not None
+    np.testing.assert_array_equal(full.times_s, [360, 600])  # frames 3 and 5, every 120 s
+
+    def of(name: str, **times: Any) -> ResultStore:
+        return ResultStore.create(
+            tmp_path / name, frames=[3, 5], y=Y, x=X, names=NAMES, chunk=(1, 4, X.size), attrs={}, **times
+        )
+
+    np.testing.assert_array_equal(of("half", interval_s=120.0, time_offset=0.5).times_s, [420, 660])
+    np.testing.assert_array_equal(of("stamps", interval_s=120.0, times_s=[361.5, 599.0]).times_s, [361.5, 599])
+    assert of("unknown").times_s is None
 
 
 def test_xarray_opens_it_without_a_warning(full: ResultStore) -> None:

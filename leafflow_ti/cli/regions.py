@@ -24,11 +24,15 @@ def regions(
     labels_frame: Annotated[
         int | None, _option("labels-frame", "T", "Frame that the label image shows [the middle one of the results].")
     ] = None,
-    still: Annotated[bool, typer.Option("--still", help="Regions keep their place; else they follow the motion.")] = False,
+    still: Annotated[
+        bool, typer.Option("--still", help="Regions keep their place; else they follow the motion.")
+    ] = False,
     start_time: Annotated[
         str | None, _option("start-time", "ISO", "Date and local time of frame 0, such as 2024-05-31T08:00.")
     ] = None,
-    diel: Annotated[Path | None, _option("diel", "FILE.csv", "Growth folded on 24 hours: a row per region and bin.")] = None,
+    diel: Annotated[
+        Path | None, _option("diel", "FILE.csv", "Growth folded on 24 hours: a row per region and bin.")
+    ] = None,
     diel_figure: Annotated[Path | None, _option("diel-figure", "FILE.png", "The same as a figure.")] = None,
     bin_h: Annotated[float, typer.Option("--bin-h", metavar="HOURS", help="Bins of the diel curve.")] = 1.0,
     light: Annotated[

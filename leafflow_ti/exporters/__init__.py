@@ -6,6 +6,7 @@ wrote. It reads one frame at a time, so that memory does not grow with the seque
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -106,7 +107,8 @@ def export(
     except OSError as error:
         raise RunError(f"{path}: cannot be written ({error.strerror or error}): mend that, or another path") from error
     finally:
-        _remove(scratch)
+        with contextlib.suppress(OSError):  # what went wrong above is what matters
+            _remove(scratch)
     return [path / file.relative_to(scratch) for file in written]
 
 
