@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from leafflow_ti.inspection import check
     from leafflow_ti.leaf_axes import leaf_coordinates
     from leafflow_ti.regions import RegionTable, measure_regions
+    from leafflow_ti.report import write_report
     from leafflow_ti.results import ResultStore
     from leafflow_ti.rig import Rig, plan_rig
     from leafflow_ti.surface_growth import measure_growth
@@ -35,14 +36,13 @@ _HOME = {
     "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
     "check": "inspection", "Rig": "rig", "plan_rig": "rig",
     "release": "engines", "Tracks": "tracks", "track": "tracking", "track_growth": "cumulative",
-    "leaf_coordinates": "leaf_axes",
-    "export": "exporters", "RegionTable": "regions", "measure_regions": "regions",
-    "measure_growth": "surface_growth",
+    "leaf_coordinates": "leaf_axes", "export": "exporters", "RegionTable": "regions", "measure_regions": "regions",
+    "measure_growth": "surface_growth", "write_report": "report",
 }  # fmt: skip
 __all__ = [
-    "Capture", "Field", "Geometry", "RegionTable", "ResultStore", "Rig", "RunConfig", "Tracks",
-    "capture_from_array", "check", "estimate", "export", "leaf_coordinates", "load_config", "measure_growth",
-    "measure_regions", "open_capture", "plan_rig", "plan_run", "release", "run", "track", "track_growth",
+    "Capture", "Field", "Geometry", "RegionTable", "ResultStore", "Rig", "RunConfig", "Tracks", "capture_from_array",
+    "check", "estimate", "export", "leaf_coordinates", "load_config", "measure_growth", "measure_regions",
+    "open_capture", "plan_rig", "plan_run", "release", "run", "track", "track_growth", "write_report",
 ]  # fmt: skip
 
 

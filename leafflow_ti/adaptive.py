@@ -26,7 +26,7 @@ from leafflow_ti.search import Extent, coarse_search
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.status import HAS_VALUE, Status
 from leafflow_ti.stays import Maps, Stay, without_images
-from leafflow_ti.surfaces import EDGE, REACH, Surfaces, dilated, vector
+from leafflow_ti.surfaces import REACH, Surfaces, vector
 from leafflow_ti.trace import span
 from leafflow_ti.units import Units
 
@@ -54,11 +54,17 @@ class _Tile:
     labels: tuple[int, ...]
     """The most frequent first."""
 
-    def groups(self, surfaces: Surfaces) -> list[list[int]]:
-        """The labels in groups of which all are within a pixel of the first: the refinement, which knows no filters,
-        sees all of them in the images that the first one aims at."""
+    @property
+    def pixels(self) -> tuple[NDArray[np.intp], ...]:
+        """The tile in maps of the whole image."""
+        return np.ix_(self.y, self.x)
+
+    def groups(self, surfaces: Surfaces, chosen: NDArray[np.int64]) -> list[list[int]]:
+        """Its labels, and others that its pixels have ``chosen``, in groups of which all are within a pixel of the
+        first: the refinement, which knows no filters, sees all of them in the images that the first one aims at."""
         found: list[list[int]] = []
-        for label in self.labels:
+        others = np.setdiff1d(chosen, (*self.labels, UNDECIDED)).tolist()
+        for label in (*self.labels, *others):
             aim = vector(surfaces.aims[label])
             near = (g for g in found if np.abs(vector(surfaces.aims[g[0]]) - aim).max() <= 1)
             group = next(near, None)
@@ -223,6 +229,29 @@ class Adaptive:
         status[self._strays(maps, surfaces, tile.y, tile.x) & np.isin(status, HAS_VALUE)] = Status.INCOHERENT
         return maps, status
 
+    def _passes(
+        self, tile: _Tile, frame: int, surfaces: Surfaces
+    ) -> tuple[dict[int, tuple[Maps, Codes]], NDArray[np.int64]]:
+        """Maps and status of a tile by label, and the label that each pixel takes: its own, or where that has no value,
+        of those offered to it the one with the highest confidence."""
+        passes = {label: self._pass(tile, surfaces, label, frame) for label in tile.labels}
+        which, mask = surfaces.number[tile.pixels].astype(np.int64), self.common.mask
+        missing = np.ones(which.shape, np.bool_) if mask is None else mask[tile.pixels].copy()
+        for label, (_, status) in passes.items():
+            missing[(which == label) & np.isin(status, HAS_VALUE)] = False
+        best = np.full(which.shape, -1.0)
+        for label, offered in surfaces.offered(tile.y, tile.x):
+            wanted = offered & missing
+            if not wanted.any():
+                continue
+            if label not in passes:
+                passes[label] = self._pass(tile, surfaces, label, frame)
+            maps, status = passes[label]
+            confidence = np.where(wanted & np.isin(status, HAS_VALUE), np.nan_to_num(maps["confidence"]), -1.0)
+            better = confidence > best
+            which[better], best[better] = label, confidence[better]
+        return passes, which
+
     def _measured(
         self, tiles: list[_Tile], shape: tuple[int, int], frame: int, surfaces: Surfaces
     ) -> tuple[Maps, Codes, NDArray[np.int64]]:
@@ -230,12 +259,11 @@ class Adaptive:
         maps: Maps = {}
         codes, chosen = np.full(shape, Status.BORDER, np.uint8), np.full(shape, UNDECIDED)
         for tile in tiles:
-            passes = [self._pass(tile, surfaces, label, frame) for label in tile.labels]
-            which = _best(passes, tile, surfaces)
-            for n, (found, status) in enumerate(passes):
-                mine = which == n
+            passes, which = self._passes(tile, frame, surfaces)
+            chosen[tile.place] = which
+            for label, (found, status) in passes.items():
+                mine = which == label
                 codes[tile.place][mine] = status[mine]
-                chosen[tile.place][mine] = tile.labels[n]
                 for name, values in found.items():
                     maps.setdefault(name, empty_map(name, shape))[tile.place][mine] = values[mine]
         return maps, codes, chosen
@@ -245,11 +273,11 @@ class Adaptive:
     ) -> None:
         """Refine a band's pixels; those that no pass has values for from what the search found around them."""
         for tile in tiles:
-            there = np.ix_(tile.y, tile.x)
-            status, wanted = codes[tile.place], surfaces.known[there] & np.isin(codes[tile.place], BEYOND)
-            for group in tile.groups(surfaces):
-                mine = np.isin(chosen[tile.place], group) & (status == Status.OK)
-                begun = np.isin(surfaces.number[there], group) & wanted
+            status, taken = codes[tile.place], chosen[tile.place]
+            wanted = surfaces.known[tile.pixels] & np.isin(status, BEYOND)
+            for group in tile.groups(surfaces, taken):
+                mine = np.isin(taken, group) & (status == Status.OK)
+                begun = np.isin(surfaces.number[tile.pixels], group) & wanted
                 if mine.any() or begun.any():
                     self._refine_group(tile, surfaces, group, frame, maps, codes, mine, begun)
 
@@ -312,30 +340,6 @@ def extent_of(plan: Plan, capture: Capture) -> Extent:
         capture.n_frames, rows, cols, capture.height, capture.width, geometry.baseline_mm,
         geometry.disparity_offset_px, capture.frame_times,
     )  # fmt: skip
-
-
-def _best(passes: list[tuple[Maps, Codes]], tile: _Tile, surfaces: Surfaces) -> NDArray[np.int64]:
-    """Which pass each pixel takes: that of its own label, or where that has no value, of those that may be meant the
-    one with the highest confidence."""
-    at = np.ix_(tile.y, tile.x)
-    number, shown = surfaces.number[at], surfaces.shown[np.ix_(range(4), tile.y, tile.x)]
-    which = np.zeros(number.shape, np.int64)
-    for n, label in enumerate(tile.labels):
-        which[number == label] = n
-    valued = np.stack([np.isin(status, HAS_VALUE) for _, status in passes])
-    missing = ~np.take_along_axis(valued, which[None], axis=0)[0]
-    if len(passes) == 1 or not missing.any():
-        return which
-    best = np.full(number.shape, -1.0)
-    around = -(-EDGE // tile.x.step)
-    for n, label in enumerate(tile.labels):
-        aim = surfaces.aims[label]
-        away = np.abs(shown - vector(aim)[:, None, None]).max(axis=0)
-        meant = (away <= REACH) | dilated(number == label, around)
-        confidence = np.where(valued[n] & meant, np.nan_to_num(passes[n][0]["confidence"]), -1.0)
-        better = missing & (confidence > best)
-        which[better], best[better] = n, confidence[better]
-    return which
 
 
 def _joined(shown: NDArray[np.float32]) -> tuple[Mask, Mask]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from leafflow_ti.config_values import (
     auto_or_integer,
@@ -17,18 +17,16 @@ from leafflow_ti.config_values import (
     machine_memory,
     noise_or_auto,
     numbers,
+    one_of,
     parse_memory,
     positive_or_auto,
 )
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import quantity
 from leafflow_ti.filters import MAX_BLUR
+from leafflow_ti.models import MODELS
 from leafflow_ti.presets import REFINED_WINDOW
 
-ModelName = Literal[
-    "auto", "flow", "flow-affine", "flow-quadratic", "depth", "affine-translation", "affine", "affine-4d", "affine-5d",
-    "scene-flow", "affine-scene-flow", "range-flow",
-]  # fmt: skip
 Motion = Literal["auto", "translation", "rotation", "acceleration"]
 Brightness = Literal["none", "temporal", "spatial", "camera"]
 Deformation = Literal["auto", "none", "growth", "strain"]
@@ -84,7 +82,7 @@ class ModelSection(Section):
     reference camera.
     """
 
-    name: ModelName = "auto"
+    name: Annotated[str, AfterValidator(lambda v: one_of(v, ("auto", *MODELS)))] = "auto"
     motion: Motion = "auto"
     deformation: Deformation = "auto"
     rows: str = "auto"

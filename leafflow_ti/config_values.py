@@ -39,6 +39,14 @@ def machine_memory() -> int:
     return min(sizes, default=8 * 2**30)
 
 
+def one_of(value: str, known: Iterable[str]) -> str:
+    """``value``, if it is one of ``known``; else ValueError."""
+    names = tuple(known)
+    if value not in names:
+        raise ValueError(f"must be one of {', '.join(names)}")
+    return value
+
+
 def integer(value: object, low: int, odd: bool = False, high: int | None = None) -> int:
     """An integer of at least ``low`` and, where that is given, at most ``high``; else ValueError."""
     try:

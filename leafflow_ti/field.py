@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.display import results_html
 from leafflow_ti.errors import MissingExtra
 from leafflow_ti.status import ADVICE, Status
 
@@ -235,6 +236,11 @@ class Field(Mapping[str, NDArray[np.float32]]):
             coords={"y": self.y, "x": self.x, "t": self.frame},
             attrs=dict(self.attrs),
         )
+
+    def _repr_html_(self) -> str:
+        rows, columns = self.shape
+        title = f"Field · frame {self.frame} · {rows} x {columns} (y, x)"
+        return results_html(title, self.maps, self.status, lambda name: quantity(name)[0])
 
     def __repr__(self) -> str:
         shares = ", ".join(f"{name} {share:.1%}" for name, share in self.status_shares().items())

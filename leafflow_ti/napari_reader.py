@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import zarr
 
+from leafflow_ti.colours import Scale
 from leafflow_ti.errors import InputError
 from leafflow_ti.field import map_attributes, quantity
-from leafflow_ti.quicklook import robust_limits
+from leafflow_ti.panels import SIGNED
 from leafflow_ti.results import ResultStore
 
 LayerData = tuple[Any, dict[str, Any], str]
@@ -63,11 +64,10 @@ def _place(store: ResultStore) -> dict[str, Any]:
 
 
 def _map(store: ResultStore, name: str, data: Any, options: dict[str, Any]) -> LayerData:
-    low, high = robust_limits(store.read(name, len(store.frames) // 2))
-    colours = "coolwarm" if low < 0 < high else "cividis" if name.endswith("_std") else "viridis"
+    scale = Scale.of(store.read(name, len(store.frames) // 2), signed=name in SIGNED, error=name.endswith("_std"))
     unit, long_name = quantity(name)
     facts = {"unit": unit, "long_name": long_name, "interval_s": store.interval_s}
-    kept = options | {"contrast_limits": (low, high), "colormap": colours, "metadata": facts}
+    kept = options | {"contrast_limits": (scale.low, scale.high), "colormap": scale.colours, "metadata": facts}
     return data, {"name": name if unit == "1" else f"{name} [{unit}]", **kept}, "image"
 
 

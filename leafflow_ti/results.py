@@ -15,8 +15,9 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import zarr
@@ -25,8 +26,12 @@ from numpy.typing import ArrayLike, NDArray
 from zarr.codecs import ZstdCodec
 from zarr.errors import NodeNotFoundError
 
-from leafflow_ti.errors import InputError, RunError, UsageError
-from leafflow_ti.field import QUANTITIES, Field, empty_map, map_attributes, with_std
+from leafflow_ti.display import results_html
+from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
+from leafflow_ti.field import QUANTITIES, Field, empty_map, map_attributes, quantity, with_std
+
+if TYPE_CHECKING:
+    import xarray
 
 WRITERS = 16
 """Chunks of a unit that are written together: the disk forces them out at once, and while kernels run, which hold the
@@ -47,7 +52,7 @@ COORDINATES: dict[str, dict[str, Any]] = {
 TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ResultStore:
     """An open results store. ``frames``, ``y``, ``x``: coordinates of the axes t, y, x; ``names``: its maps."""
 
@@ -260,6 +265,33 @@ class ResultStore:
         """All maps of the frame with index ``t_index`` along t."""
         maps = {name: self.read(name, t_index) for name in self.names}
         return Field(maps, self.read("status", t_index), self.y, self.x, self.frames[t_index], self.attrs)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All frames as a Dataset with dimensions ``t, y, x`` and CF attributes, read from disk as they are used.
+
+        Raises MissingExtra where xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise MissingExtra("xarray", "xarray", "ResultStore.to_xarray") from None
+        dataset: xarray.Dataset = xarray.open_zarr(self.path, consolidated=False, chunks=None)
+        return dataset
+
+    def _repr_html_(self) -> str:
+        """The middle one of the frames that are done, and how many are."""
+        done = sorted({unit // self.bands for unit in self.done()})
+        title = f"{self.path.name} · {len(done)} of {len(self.frames)} frames · {self.y.size} x {self.x.size} (y, x)"
+        if not done:
+            return f"<p><b>{escape(title)}</b></p>"
+        field = self.field(done[len(done) // 2])
+        title = f"{title} · below: frame {field.frame}"
+        return results_html(title, field.maps, field.status, lambda name: quantity(name)[0])
+
+    def __repr__(self) -> str:
+        names = ", ".join(name for name in self.names if not name.endswith("_std"))
+        size = f"{len(self.frames)} x {self.y.size} x {self.x.size} (t, y, x)"
+        return f"<ResultStore {self.path.name}, {size}, {len(self.done())} of {self.n_units} units done: {names}>"
 
     def add_maps(self, names: Sequence[str], attrs: Mapping[str, Any]) -> ResultStore:
         """The store with further maps, empty (those it has lose their values), to be filled by ``write_map``.

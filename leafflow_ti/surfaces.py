@@ -8,7 +8,7 @@ which another surface lies before it. A pass's result does not depend on where t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -27,7 +27,7 @@ REACH = 1.5
 """Residual [px per step or frame] up to which a pixel belongs to the surface of a pass: what the filters still follow
 around the half pixel that rounding leaves, and a slope of the surface within its window."""
 EDGE = 2
-"""Pixels within which the search may have drawn an edge between surfaces wrongly."""
+"""Pixels within which the search may have drawn an edge between surfaces, or between labels of one, wrongly."""
 FEWEST = 24
 """Pixels of a label in the image below which the nearest other label takes them."""
 
@@ -68,6 +68,14 @@ class Surfaces:
                 at[axis - 1] = side
                 found[tuple(at)] |= step
         return dilated(found, reach - 1)
+
+    def offered(self, y: range, x: range) -> Iterator[tuple[int, Mask]]:
+        """Labels in the order of their numbers, and which pixels [rows, cols] at rows and columns ``y``, ``x`` may be
+        of them: those within ``EDGE`` px of one that is. Says the same of a pixel whatever the others are."""
+        rows, cols = (slice(max(0, n[0] - EDGE), n[-1] + EDGE + 1) for n in (y, x))
+        number, here = self.number[rows, cols], np.ix_(np.array(y) - rows.start, np.array(x) - cols.start)
+        for label in np.unique(number).tolist():
+            yield label, dilated(number == label, EDGE)[here]
 
     def layer(self, aims: Sequence[Aim], box: Box) -> Mask:
         """Where the surface of some labels is, in a block of the reference image; False beyond the image.

@@ -91,6 +91,14 @@ CASES = (
     Case(
         "refine-growth", "refinement.growth:run", "growth and strain of a moving, turning, tilted patch (tobacco rig)"
     ),
+    Case(
+        "leaf-growth",
+        "leaf_growth:run",
+        "a curved leaf that grows, moves, tilts, changes its light: refined, and from the motion",
+    ),
+    Case(
+        "refine-rigid", "refinement.rigid:run", "growth of what does not grow: cubes under every light, turning planes"
+    ),
     Case("refine-coverage", "refinement.coverage:run", "whether the refinement's error bars are true, by noise"),
     Case("refine-time", "refinement.timing:run", "what the refinement costs beside the affine stages, and by image"),
     Case("scaling", "scaling:run", "cost against image size, cameras, window, stride, sigma and columns, as a picture"),

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from leafflow_ti.colours import STATUS_COLOURS
 from leafflow_ti.errors import MissingExtra
-from leafflow_ti.quicklook import STATUS_COLOURS
 from leafflow_ti.status import Status
 
 Array = NDArray[Any]

@@ -102,8 +102,8 @@ class Session:
                     for call in calls(block):
                         run_call(call, f"{page.name}, line {call.line}")
                 elif block.language == "python":
-                    # What is shown is what users run.
-                    exec(compile(block.text, place, "exec"), names)
+                    with contextlib.redirect_stdout(io.StringIO()):
+                        exec(compile(block.text, place, "exec"), names)
                 elif block.language == "toml":
                     check_toml(block.text, self.folder)
                 else:
@@ -132,18 +132,22 @@ def compare(shown: tuple[str, ...], output: str, place: str) -> None:
     """Every shown line is one of the output, in the same order; numbers agree within ``TOLERANCE``, … is anything."""
     rest = iter(output.splitlines())
     for line in shown:
-        assert line.strip() == "…" or any(agree(line.split(), real.split()) for real in rest), (
+        assert line.strip() == "…" or any(agree(line, real) for real in rest), (
             f"{place}: the output has no line\n{line}\nwhere the page shows it; it is\n{output}"
         )
 
 
-def agree(shown: list[str], real: list[str]) -> bool:
-    """Whether the words of a line are those shown."""
+def agree(shown: str, real: str) -> bool:
+    """Whether a line of output is the one shown: numbers agree within ``TOLERANCE``, … is any words."""
+    return _agree(shown.split(), real.split())
+
+
+def _agree(shown: list[str], real: list[str]) -> bool:
     if not shown:
         return not real
     if shown[0] == "…":
-        return any(agree(shown[1:], real[n:]) for n in range(len(real) + 1))
-    return bool(real) and _same(shown[0], real[0]) and agree(shown[1:], real[1:])
+        return any(_agree(shown[1:], real[n:]) for n in range(len(real) + 1))
+    return bool(real) and _same(shown[0], real[0]) and _agree(shown[1:], real[1:])
 
 
 def _same(shown: str, real: str) -> bool:

@@ -28,6 +28,8 @@ LEAVES = LeavesScene(
     size=(201, 151), n_cols=5, n_rows=3, n_frames=5, leaves=3, disparity_px=(3.0, 15.0), motion_px=6.0,
     supersampling=1, noise=1.0,
 )  # fmt: skip
+SLANTED = replace(scene_of(3.3, baseline_mm=2.2), zx=0.9, size=(201, 131), noise=1.0)
+"""Has several labels within a tile."""
 MIDDLE = (32, 32, 169, 119)
 """Windows there are full."""
 OPTIONS: dict[str, object] = {
@@ -110,6 +112,22 @@ def test_tiles_change_no_bit_without_refinement(leaves: Capture) -> None:
     assert_same(whole, lf.estimate(leaves, **{**OPTIONS, "refine": 0}, tile=7))
 
 
+def measured_by_tiles(monkeypatch: pytest.MonkeyPatch, tile: int, across: int, **options: object) -> lf.Field:
+    """The slanted plane ``SLANTED``, computed in tiles of so many output rows, and pixels across."""
+    monkeypatch.setattr(plan, "TILE_PIXELS", across)
+    return lf.estimate(
+        captured(SLANTED), model="affine-4d", window=21, size_time=3, taps_time="3", stride=2, tile=tile,
+        preshift="adaptive", border="clip", refine=0, **options,
+    )  # fmt: skip
+
+
+def test_tiles_change_no_bit_where_labels_lend(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pixels at the image's border whose own label has no value take a neighbouring one's, of another tile, too."""
+    narrow, whole = (measured_by_tiles(monkeypatch, tile, across) for tile, across in ((10, 32), (35, 192)))
+    assert np.isin(whole.status, HAS_VALUE).mean() > 0.99
+    assert_same(whole, narrow)
+
+
 def test_resumed_run_ends_with_the_same_bytes(leaves: Capture, tmp_path: Path) -> None:
     wanted = config(tile=10, frames="2:3")
 
@@ -127,21 +145,14 @@ def test_resumed_run_ends_with_the_same_bytes(leaves: Capture, tmp_path: Path) -
 def test_no_seams_at_tiles_and_labels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps between neighbouring pixels of a slanted plane: where a tile ends, they are those that the same pixels have
     inside a tile; where the whole-pixel shift changes, as elsewhere but for what filters leave of half a pixel."""
-    scene = replace(scene_of(3.3, baseline_mm=2.2), zx=0.9, size=(201, 131), noise=1.0)
-
-    def measured(tile: int, across: int) -> lf.Field:
-        monkeypatch.setattr(plan, "TILE_PIXELS", across)
-        return lf.estimate(
-            captured(scene), model="affine-4d", window=21, size_time=3, taps_time="3", stride=2, tile=tile,
-            preshift="adaptive", border="clip", roi=(50, 30, 150, 100), refine=0,
-        )  # fmt: skip
-
-    field, whole = measured(10, 32), measured(35, 192)
+    field, whole = (
+        measured_by_tiles(monkeypatch, tile, across, roi=(50, 30, 150, 100)) for tile, across in ((10, 32), (35, 192))
+    )
     ok = field.status == Status.OK
     assert ok.mean() > 0.99
-    maps = exact(scene)
+    maps = exact(SLANTED)
     there = np.ix_(field.y, field.x)
-    disparity = -F_PX * scene.baseline_mm[0] / maps["depth"][there]
+    disparity = -F_PX * SLANTED.baseline_mm[0] / maps["depth"][there]
     aims = np.stack([np.rint(disparity), *(np.rint(maps[f"flow_{axis}"][there]) for axis in "xy")])
     assert len(np.unique(aims[0])) > 3
     border = (np.diff(aims, axis=2) != 0).any(axis=0)

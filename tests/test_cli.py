@@ -20,7 +20,8 @@ import typer
 from leafflow_ti import __version__, config, config_sections, errors
 from leafflow_ti.cli import main as cli
 from leafflow_ti.cli import options
-from leafflow_ti.cli.progress import ProgressLine, format_duration, format_progress, format_rate
+from leafflow_ti.cli.progress import ProgressLine, format_progress, format_rate
+from leafflow_ti.number_text import duration
 from leafflow_ti.progress import Progress, RunSummary, Timings
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import ADVICE, Status
@@ -58,7 +59,10 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert call("--help") == 0
     text = capsys.readouterr().out
     assert all(f"\n  {name} " in text for name in cli.COMMANDS)
-    assert set(cli.COMMANDS) == {"simulate", "run", "evaluate", "profile", "plan-rig", "check", "info", "demo"}
+    assert set(cli.COMMANDS) == {
+        "simulate", "run", "growth", "evaluate", "track", "export", "regions", "profile", "check", "plan-rig",
+        "report", "info", "demo",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
@@ -336,7 +340,6 @@ def test_run_without_capture_exits_with_4_or_3(
 def test_choices_in_the_help_are_those_of_the_configuration(name: str) -> None:
     choices = getattr(config_sections, name, None) or getattr(config, name)
     assert get_args(getattr(options, name))[1].metavar == "|".join(get_args(choices))
-    assert get_args(options.Model)[1].metavar == "|".join(get_args(config_sections.ModelName))
 
 
 # --- progress --------------------------------------------------------------------------------------------------------
@@ -346,7 +349,7 @@ def test_progress_in_words() -> None:
     assert format_progress(Progress(3, 12, 250_000, 1_000_000, 10.0)) == "unit 3/12, 25%, 25.0 kpx/s, 30 s left"
     assert format_progress(Progress(0, 12, 0, 1_000_000, 0.0)) == "unit 0/12, 0%"
     assert format_progress(Progress(0, 0, 0, 0, 0.0)) == "unit 0/0, 100%"
-    assert [format_duration(s) for s in (59.4, 200, 7500)] == ["59 s", "3 min 20 s", "2 h 05 min"]
+    assert [duration(s) for s in (59.4, 200, 7500)] == ["59 s", "3 min 20 s", "2 h 05 min"]
     assert [format_rate(r) for r in (850, 12_340, 1.2e6)] == ["850 px/s", "12.3 kpx/s", "1.2 Mpx/s"]
 
 
@@ -486,7 +489,7 @@ def test_demo_prints_what_it_does(
     real(["demo", str(tmp_path / "d"), *flags])
     printed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("$ leafflow-ti ")]
     assert printed == [f"$ leafflow-ti {' '.join(step)}" for step in steps]
-    assert [step[0] for step in steps] == ["simulate", "run", "evaluate"]
+    assert [step[0] for step in steps] == ["simulate", "run", "evaluate", "report"]
     assert size in steps[0]
 
 

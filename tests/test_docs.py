@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from leafflow_ti.config import RunConfig
 
 pytestmark = pytest.mark.xdist_group("docs")
 
-CONTINUES = {"growth.md": "getting-started.md", "opening.md": "growth.md", "formats.md": "getting-started.md"}
+CONTINUES = {"opening.md": "growth.md", "formats.md": "getting-started.md"}
 """Pages that go on with the files of another one."""
 
 
@@ -59,25 +60,35 @@ def settings(model: type[BaseModel]) -> dict[str, Any]:
     return found
 
 
-def table_keys(text: str, title: str) -> list[str]:
-    """Dotted keys in the first column of the tables below the heading ``title``: ``### [section]``, then ``| `key` |``."""
+def table_defaults(text: str, title: str) -> list[tuple[str, str]]:
+    """Dotted keys and defaults below the heading ``title``: sections ``### `[name]```, rows ``| `key` | default |``."""
     part = text.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
-    section, keys = "", []
+    section, found = "", []
     for line in part.splitlines():
         if heading := re.match(r"### (?:`\[(\w+)\]`)?", line):
             section = f"{heading[1]}." if heading[1] else ""
-        elif row := re.match(r"\| `(\w+)` \|", line):
-            keys.append(section + row[1])
-    return keys
+        elif row := re.match(r"\| `(\w+)` \|([^|]*)\|", line):
+            found.append((section + row[1], row[2].strip()))
+    return found
 
 
 @pytest.mark.parametrize(
     ("title", "model"), [("The capture: `capture.toml`", Description), ("Settings of a run: `run.toml`", RunConfig)]
 )
 def test_the_reference_of_settings_is_complete(title: str, model: type[BaseModel]) -> None:
-    listed = table_keys((ROOT / "docs/formats.md").read_text(encoding="utf-8"), title)
-    assert len(set(listed)) == len(listed)
-    assert set(listed) == set(settings(model))
+    listed = table_defaults((ROOT / "docs/formats.md").read_text(encoding="utf-8"), title)
+    known = settings(model)
+    assert sorted(key for key, _ in listed) == sorted(known)
+    for key, default in listed:
+        if code := re.fullmatch(r"`(.*)`", default):  # else it is said in words
+            assert_default(key, code[1], known[key].get_default(call_default_factory=True))
+
+
+def assert_default(key: str, shown: str, default: object) -> None:
+    """The default in the table is that of the program; one that depends on the image or the file is None there."""
+    if default is not None:
+        expected = tomllib.loads(f"value = {shown}")["value"]
+        assert expected == (list(default) if isinstance(default, tuple) else default), key
 
 
 @pytest.mark.parametrize("page", [*PAGES, README], ids=lambda page: page.stem)
@@ -109,10 +120,10 @@ def test_public_names_have_documentation() -> None:
 
 
 def test_shown_output_is_compared() -> None:
-    assert agree(["depth", "mm", "…", "9.85"], ["depth", "mm", "971", "9.86"])
-    assert not agree(["depth", "mm", "…", "9.85"], ["depth", "mm", "971", "9.2"])
-    assert not agree(["done"], ["done", "in", "3", "s"])
-    assert agree(["done", "in", "…", "s"], ["done", "in", "3", "s"])
+    assert agree("depth mm … 9.85", "depth mm 971 9.86")
+    assert not agree("depth mm … 9.85", "depth mm 971 9.2")
+    assert not agree("done", "done in 3 s")
+    assert agree("done in … s", "done in 3 s")
 
 
 def test_calls_are_found_with_their_output(tmp_path: Path) -> None:

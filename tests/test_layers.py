@@ -16,7 +16,7 @@ import leafflow_ti
 PACKAGE = Path(leafflow_ti.__file__).parent
 
 LAYERS: dict[str, int] = {
-    **dict.fromkeys(("errors", "status", "progress", "trace", "background"), 1),
+    **dict.fromkeys(("errors", "status", "progress", "trace", "background", "number_text"), 1),
     **dict.fromkeys(("kernels",), 2),
     **dict.fromkeys(
         (
@@ -44,6 +44,8 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("range_plan", "range_source", "range_engine"), 6),
     **dict.fromkeys(("matching", "positions", "photometry"), 3),
     **dict.fromkeys(("expected", "correlation"), 6),
+    **dict.fromkeys(("colours", "display"), 2),
+    **dict.fromkeys(("panels", "report"), 7),
     **dict.fromkeys(("surface_growth",), 7),
     **dict.fromkeys(("quicklook", "api", "profiling", "profile_cases", "profile_report"), 7),
     **dict.fromkeys(("tables",), 3),

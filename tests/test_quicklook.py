@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from leafflow_ti.colours import STATUS_COLOURS, normal_colours, robust_limits
 from leafflow_ti.errors import MissingExtra, RunError
-from leafflow_ti.quicklook import STATUS_COLOURS, normal_colours, robust_limits, write_quicklooks
+from leafflow_ti.quicklook import write_quicklooks
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 

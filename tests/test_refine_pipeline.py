@@ -14,7 +14,8 @@ import leafflow_ti as lf
 from leafflow_ti import refinement
 from leafflow_ti.capture import Capture
 from leafflow_ti.config import RunConfig, load_config
-from leafflow_ti.field import IDENTIFIED
+from leafflow_ti.correlation import velocity_covariance
+from leafflow_ti.field import CORRELATIONS, IDENTIFIED
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import PlaneScene, truth
 
@@ -186,6 +187,23 @@ def test_strain_is_measured(capture: Capture) -> None:
     growth = found["growth_rate"][ok]
     both = sum(found[f"strain_rate_{name}"][ok] for name in ("11", "22"))
     np.testing.assert_allclose(growth, both, atol=1e-3)
+    axes = {"rate_1": 0.1 + np.hypot(0.3, 0.3), "rate_2": 0.1 - np.hypot(0.3, 0.3), "angle": np.pi / 8}
+    for name, value in axes.items():
+        values, std = found[f"principal_{name}"][ok], found[f"principal_{name}_std"][ok]
+        assert np.isfinite(std).all()
+        assert np.mean(values) == pytest.approx(value, abs=3 * float(std.mean()))
+
+
+def test_velocities_have_the_correlations_of_their_covariance(capture: Capture, refined: lf.Field) -> None:
+    """The refinement's, where it is refined; with the standard errors they make a covariance."""
+    ok = refined.status == Status.OK
+    covariance = velocity_covariance(refined)[ok]
+    assert (np.linalg.eigvalsh(covariance / np.trace(covariance, axis1=1, axis2=2)[:, None, None]) > -1e-4).all()
+    plain = measure(capture, refine=0)
+    for name in CORRELATIONS:
+        assert (np.abs(refined[name][ok]) <= 1).all()
+        assert (refined[name][ok] != plain[name][ok]).any()
+        assert np.isnan(refined[name][refined.status == Status.BORDER]).all()
 
 
 FLAT = replace(

@@ -10,7 +10,7 @@ import pytest
 from leafflow_ti.aim import Aim
 from leafflow_ti.reading import Box
 from leafflow_ti.search import Coarse, Extent
-from leafflow_ti.surfaces import REACH, Surfaces, dilated, vector
+from leafflow_ti.surfaces import EDGE, REACH, Surfaces, dilated, vector
 
 SHAPE = (40, 60)
 BASELINE = (5.0, -2.5)
@@ -119,3 +119,16 @@ def test_edges_are_where_displacements_jump(device: Callable) -> None:
     assert edges[beside].all()
     assert not edges[34:].any()
     assert not edges[:3, :28].any()
+
+
+def test_labels_are_offered_around_their_pixels(device: Callable) -> None:
+    """Whatever pixels are asked for: every other one of a few rows and columns, beside naive loops."""
+    surfaces = two_leaves(device)
+    y, x = range(3, 33, 2), range(21, 60, 3)
+    offered = dict(surfaces.offered(y, x))
+    assert len(offered) > 2
+    for label in range(len(surfaces.aims)):
+        for i, j in np.ndindex(len(y), len(x)):
+            rows, cols = (slice(max(0, n - EDGE), n + EDGE + 1) for n in (y[i], x[j]))
+            around = (surfaces.number[rows, cols] == label).any()
+            assert around == (label in offered and offered[label][i, j])

@@ -25,6 +25,7 @@ from leafflow_ti.capture.flaws import Flaws
 from leafflow_ti.capture.images import checksum
 from leafflow_ti.capture.lens import Lens
 from leafflow_ti.capture.measured import FRACTION_DIGITS, LEAST_FRACTION, REACH, interpolated
+from leafflow_ti.display import table_html
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,18 @@ class Capture(ABC):
     """For each camera row and column the lens whose distortion is taken out; None: images are taken as they are."""
     flaws: Flaws | None = field(default=None, repr=False, kw_only=True)
     """Pixels that are read as NaN."""
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("frames", str(self.n_frames)),
+            ("interval", "not stated" if self.frame_interval_s is None else f"{self.frame_interval_s:g} s"),
+            ("cameras", f"{self.n_rows} x {self.n_cols} (rows, columns)"),
+            ("images", f"{self.width} x {self.height} px, {self.bits} bit in {self.dtype}"),
+        ]
+        if self.geometry is not None:
+            steps = ", ".join(f"{step:g}" for step in self.geometry.baseline_mm)
+            rows += [("focal length", f"{self.geometry.f_px:g} px"), ("camera step", f"{steps} mm (x, y)")]
+        return f"<div><p><b>Capture</b></p>{table_html((), rows)}</div>"
 
     @property
     def finite(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shlex
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +22,7 @@ def demo(
     folder: Annotated[Path, typer.Argument(metavar="OUTDIR", help="Folder to create.")] = Path("leafflow-demo"),
     full: Annotated[bool, typer.Option("--full", help="Images of 301 x 301 px, window of 65 px.")] = False,
 ) -> None:
-    """Simulate a rotating cube, measure it, compare with the truth, draw pictures.
+    """Simulate a rotating cube, measure it, compare with the truth, write a report.
 
     Nine cameras see nine frames of a textured cube that turns by 0.4 degrees and moves by 1 mm per frame.
     """
@@ -30,7 +31,8 @@ def demo(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty: remove it, or name another folder")
     scene, settings = FULL if full else SMALL
-    capture, out = folder / "cube", folder / "cube.zarr"
+    pictures = importlib.util.find_spec("matplotlib") is not None
+    capture, out, page = folder / "cube", folder / "cube.zarr", folder / "cube.html"
     for title, arguments in (
         ("A synthetic capture with its exact truth", ["simulate", "cube", str(capture), *scene]),
         (
@@ -38,9 +40,13 @@ def demo(
             ["run", str(capture), "-o", str(out), *settings],
         ),
         ("Compared with the truth", ["evaluate", str(out), "--truth", str(capture / "truth.npz")]),
+        *([("All of it on one page", ["report", str(out), "-o", str(page)])] if pictures else []),
     ):
         typer.echo(f"\n# {title}\n$ leafflow-ti {shlex.join(arguments)}")
         invoke(arguments)
-    typer.echo(
-        f"\n# Look at\n{quicklook_folder(out) / 'overview.png'}\n{out}  (leafflow-ti info {shlex.quote(str(out))})"
-    )
+    typer.echo("\n# Look at")
+    if pictures:
+        typer.echo(f"{page}  (in any browser)\n{quicklook_folder(out) / 'overview.png'}")
+    else:
+        typer.echo("no report, no pictures: they need matplotlib (pip install 'leafflow-ti[plot]')")
+    typer.echo(f"{out}  (leafflow-ti info {shlex.quote(str(out))})")

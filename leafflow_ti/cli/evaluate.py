@@ -43,10 +43,10 @@ def evaluate(
     """Compare results with a known truth.
 
     Reports the average angular error (AAE) of velocity, rotation and acceleration, each as the angle between (v, 1)
-    and its truth in mm/frame, rad/frame and mm/frame², errors of depth, slopes, growth and strain, and how well the standard errors
-    describe them: (estimate - truth)/std should have mean 0 and standard deviation 1. Values of the coarse search,
-    which have no standard errors, are left out. Labels of truth.npz (face, region) are reported apart, each whole and
-    without its border.
+    and its truth in mm/frame, rad/frame and mm/frame², errors of depth, slopes, growth and strain, and how well the
+    standard errors describe them: (estimate - truth)/std should have mean 0 and standard deviation 1. Values of the
+    coarse search, which have no standard errors, are left out. Labels of truth.npz (face, region) are reported apart,
+    each whole and without its border.
     """
     if margin is not None and margin < 0:
         raise UsageError(f"--margin {margin}: must be 0 or more pixels")

@@ -19,7 +19,7 @@ from leafflow_ti.errors import LeafflowError
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": (
         "demo:demo",
-        "Simulate a rotating cube, measure it, compare with the truth, draw pictures: no input needed.",
+        "Simulate a rotating cube, measure it, compare with the truth, write a report: no input needed.",
     ),
     "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube)."),
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
@@ -31,6 +31,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "profile": ("profile:profile", "Measure the stages of a run on this machine, and predict the whole."),
     "check": ("check:check", "Say whether a capture can be measured, and what to change."),
     "plan-rig": ("plan_rig:plan_rig", "Predict the standard errors of a camera rig, and what would improve it most."),
+    "report": ("report:report", "Write one HTML page of results: maps, curves, quality, the surface in 3D."),
     "info": ("info:info", "Say what a capture, or a results store, is."),
 }
 """Command -> where it lives (module of this package:object) and its line in the help."""

@@ -14,6 +14,8 @@ from typing import Annotated, Any
 
 import typer
 
+from leafflow_ti.models import MODELS
+
 
 def _text(name: str, metavar: str, help: str) -> Any:
     return typer.Option(f"--{name}", metavar=metavar, help=help, show_default=False)
@@ -26,8 +28,7 @@ Model = Annotated[
     str | None,
     _text(
         "model",
-        "auto|flow|flow-affine|flow-quadratic|depth|affine-translation|affine|affine-4d|affine-5d|scene-flow|"
-        "affine-scene-flow|range-flow",
+        "|".join(("auto", *MODELS)),
         "What is estimated [auto: affine-scene-flow, depth without time, flow-affine for one camera].",
     ),
 ]

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from leafflow_ti.cli import options
-from leafflow_ti.cli.progress import format_duration, format_rate
+from leafflow_ti.cli.progress import format_rate
 from leafflow_ti.errors import UsageError
+from leafflow_ti.number_text import duration
 from leafflow_ti.trace import BACKGROUND_STAGES, STAGES
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def format_profile(found: Profile) -> list[str]:
         f"speed       {format_rate(found.pixels_per_second)}, limited by {found.limit}",
         f"memory      {found.planned_bytes / 2**20:.0f} MiB planned{peak}",
         f"whole       {whole.units} units ({whole.frames} frames x {whole.bands} bands, {whole.frames_read} frames "
-        f"read): about {format_duration(whole.seconds)}",
+        f"read): about {duration(whole.seconds)}",
         f"            = compiling + {parts}",
     ]
 

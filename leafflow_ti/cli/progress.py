@@ -6,20 +6,11 @@ import sys
 import time
 from typing import TextIO
 
+from leafflow_ti.number_text import duration
 from leafflow_ti.progress import Progress
 
 TERMINAL_INTERVAL_S = 0.1
 LOG_INTERVAL_S = 30.0
-
-
-def format_duration(seconds: float) -> str:
-    """``45 s``, ``3 min 20 s``, ``2 h 05 min``."""
-    total = round(seconds)
-    if total < 60:
-        return f"{total} s"
-    if total < 3600:
-        return f"{total // 60} min {total % 60:02d} s"
-    return f"{total // 3600} h {total % 3600 // 60:02d} min"
 
 
 def format_rate(pixels_per_second: float) -> str:
@@ -35,7 +26,7 @@ def format_progress(progress: Progress) -> str:
     share = progress.pixels_done / progress.pixels_total if progress.pixels_total else 1.0
     parts = [f"unit {progress.done_units}/{progress.total_units}", f"{share:.0%}"]
     if progress.pixels_per_second is not None and progress.seconds_left is not None:
-        parts += [format_rate(progress.pixels_per_second), f"{format_duration(progress.seconds_left)} left"]
+        parts += [format_rate(progress.pixels_per_second), f"{duration(progress.seconds_left)} left"]
     return ", ".join(parts)
 
 

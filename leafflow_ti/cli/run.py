@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from leafflow_ti.cli import options
-from leafflow_ti.cli.progress import ProgressLine, format_duration
+from leafflow_ti.cli.progress import ProgressLine
 from leafflow_ti.errors import UsageError
+from leafflow_ti.number_text import duration
 
 if TYPE_CHECKING:
     from leafflow_ti.progress import RunSummary
@@ -91,7 +92,7 @@ def write_pictures(out: Path) -> Path:
 def format_summary(summary: RunSummary, pictures: Path | None) -> str:
     """Time, device, where the results are, and the shares of the statuses with advice."""
     lines = [
-        f"done in {format_duration(summary.seconds)} on {summary.device} (compiling: {summary.compile_seconds:.1f} s)",
+        f"done in {duration(summary.seconds)} on {summary.device} (compiling: {summary.compile_seconds:.1f} s)",
         *format_status(summary.status_counts),
         f"results: {summary.path}",
     ]
