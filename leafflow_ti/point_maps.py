@@ -25,6 +25,9 @@ FLOW = ("flow_x", "flow_y")
 VELOCITY = ("velocity_x", "velocity_y", "velocity_z")
 ACCELERATION = ("acceleration_x", "acceleration_y", "acceleration_z")
 SLOPES = ("slope_x", "slope_y")
+UNKNOWN = 1e6
+"""Standard error [px/frame] of a motion that is not determined: beyond any limit, but not infinite, which correlated
+errors would turn into NaN when they are summed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +156,7 @@ class PointMaps:
                 motion[k] = scale * (maps[name] - ray * ahead)
                 variance[k] = scale**2 * (one**2 + two**2 + 2 * both)
             std = np.sqrt(np.maximum(variance, 0))
-        return motion, np.where(np.isnan(std), np.inf, std)
+        return motion, np.nan_to_num(std, nan=UNKNOWN, posinf=UNKNOWN)
 
     def _joined(self, maps: Maps) -> Joined | None:
         if "depth" not in maps:

@@ -142,7 +142,8 @@ def _followed(
         guess = now if before is None else now + 0.5 * step / before[1] * (now - before[0])
         place = at[k - 1] + step * guess
         for _ in range(ROUNDS):
-            place = at[k - 1] + known + ahead * frame.motion(place)
+            better = at[k - 1] + known + ahead * frame.motion(place)
+            place = np.where(np.isfinite(better), better, place)  # where nothing is measured, that is the reason
         found = frame.reading(place)
         status = np.where(status == Reading.OK, found, status)
         alive = status == Reading.OK

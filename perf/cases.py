@@ -74,6 +74,9 @@ CASES = (
     Case(
         "compare", "compare:run", "beside NumPy/SciPy, numba, PyTorch, structure-tensor, scikit-image: times, agreement"
     ),
+    Case(
+        "tracking", "tracking:run", "material followed over 60 frames: drift and cumulative growth, exact and measured"
+    ),
     Case("sequence", "sequence:run_sequence", "30 frames from files against 12: time per frame, peak memory"),
     Case("large", "sequence:run_large", "1600x1200 pixels by 9 cameras within a memory cap"),
     Case("scene-flow-ratio", "ratio:run", "affine-scene-flow against affine-4d on the same capture"),
