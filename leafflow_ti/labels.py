@@ -84,6 +84,11 @@ class Coverage:
     share: NDArray[np.float64]
     block: int
 
+    @classmethod
+    def everywhere(cls, shape: tuple[int, int]) -> Coverage:
+        """All of maps of this shape."""
+        return cls((slice(0, shape[0]), slice(0, shape[1])), np.ones(shape), 1)
+
     @property
     def pixels(self) -> int:
         """Pixels of the image that are the region's."""

@@ -4,7 +4,7 @@ Means are over the pixels with the status ``ok``, weighted by the area of the su
 
     dA = |∂s/∂x × ∂s/∂y|,   s = Z r   (r the viewing ray)
 
-or, without a depth, alike.
+or, without a depth, alike; pixels less certain than most count less (``certain``).
 """
 
 from __future__ import annotations
@@ -144,12 +144,24 @@ def _attitude(part: _Part) -> dict[str, float]:
     }  # fmt: skip
 
 
+def certain(std: Floats) -> Floats:
+    """Weights of pixels with these standard errors [y, x], 0 where they are not finite.
+
+    All that are as good as the median count alike, so that a mean is one over the surface, not over its sharpest
+    texture; worse ones count less, as 1/std², so that a few bad ones cannot spoil it.
+    """
+    known = np.isfinite(std) & (std > 0)
+    if not known.any():
+        return np.zeros(std.shape)
+    return np.where(known, np.minimum(1.0, np.median(std[known]) / np.where(known, std, 1.0)) ** 2, 0.0)
+
+
 def _mean(name: str, part: _Part) -> dict[str, float]:
     """Mean, its standard error and the standard deviation of one map over a region, in the map's own unit."""
     known = np.isfinite(part.maps[name])
-    if f"{name}_std" in part.maps:
-        known &= np.isfinite(part.maps[f"{name}_std"])
     weights = np.where(known, part.weights, 0.0)
+    if f"{name}_std" in part.maps:
+        weights *= certain(np.where(known & (weights > 0), part.maps[f"{name}_std"], np.nan))
     if not weights.any():
         return {}
     share, values = weights / weights.sum(), np.where(known, part.maps[name], 0.0)

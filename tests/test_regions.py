@@ -22,7 +22,7 @@ from leafflow_ti.labels import Labels, covered
 from leafflow_ti.mesh import surface_points
 from leafflow_ti.region_divergence import Adjoint, differenced, fitted
 from leafflow_ti.region_noise import RegionNoise, mean_variance
-from leafflow_ti.region_rows import surface_area
+from leafflow_ti.region_rows import certain, surface_area
 from leafflow_ti.region_table import over_frames
 from leafflow_ti.regions import RegionTable, measure_regions
 from leafflow_ti.results import ResultStore
@@ -355,6 +355,12 @@ def test_old_stores_count_errors_as_the_same_throughout_a_window(tmp_path: Path)
     table = measure_regions(store, label_image())
     assert "does not state how errors hang together" in table.notes[0]
     np.testing.assert_allclose(table.of(1)["growth_se_percent_per_frame"], 0.02, rtol=1e-5)  # the pixel's own
+
+
+def test_pixels_as_good_as_the_median_count_alike() -> None:
+    weights = certain(np.array([[1.0, 2.0, 2.0], [4.0, np.nan, np.inf]]))
+    assert weights == pytest.approx(np.array([[1.0, 1.0, 1.0], [0.25, 0.0, 0.0]]))
+    assert not certain(np.full((2, 2), np.nan)).any()
 
 
 def test_means_over_frames_know_what_frames_share() -> None:

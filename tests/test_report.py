@@ -23,7 +23,7 @@ from leafflow_ti.mesh import surface_mesh
 from leafflow_ti.number_text import axis_labels, duration, readable, round_steps, to_digits_of, with_error
 from leafflow_ti.report import LIMIT, facts, write_report
 from leafflow_ti.report.charts import curves
-from leafflow_ti.report.facts import Series, certain, spread_evenly
+from leafflow_ti.report.facts import Series, spread_evenly
 from leafflow_ti.report.regions_table import read_region_curves
 from leafflow_ti.report.surface import packed, packed_surfaces
 
@@ -240,12 +240,6 @@ def test_a_few_bad_pixels_do_not_spoil_the_mean(tmp_path: Path) -> None:
     after = facts.Facts.of(store).growth[0]
     assert after.mean == pytest.approx(before.mean, rel=1e-3)
     assert after.error == pytest.approx(before.error, rel=0.01)
-
-
-def test_pixels_as_good_as_the_median_count_alike() -> None:
-    weights = certain(np.array([[1.0, 2.0, 2.0], [4.0, np.nan, np.inf]]))
-    assert weights == pytest.approx(np.array([[1.0, 1.0, 1.0], [0.25, 0.0, 0.0]]))
-    assert not certain(np.full((2, 2), np.nan)).any()
 
 
 def test_growth_rests_on_pixels_that_are_ok(tmp_path: Path) -> None:

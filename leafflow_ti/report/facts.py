@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from leafflow_ti.display import Medians
 from leafflow_ti.field import WITHOUT_STD, Field
+from leafflow_ti.labels import Coverage
 from leafflow_ti.panels import quantity_title, shown_in
 from leafflow_ti.region_noise import RegionNoise
-from leafflow_ti.regions import mean_over, over_frames, surface_area
+from leafflow_ti.region_rows import region_row, surface_area
+from leafflow_ti.region_table import over_frames
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import HAS_VALUE, Status
 
@@ -119,20 +121,8 @@ def precision_of(store: ResultStore, frames: Sequence[int]) -> list[Precision]:
     return found
 
 
-def certain(std: Floats) -> Floats:
-    """Weights of pixels with these standard errors [y, x], 0 where they are not finite.
-
-    All that are as good as the median count alike, so that a mean is one over the surface, not over its sharpest
-    texture; worse ones count less, as 1/std², so that a few bad ones cannot spoil it.
-    """
-    known = np.isfinite(std) & (std > 0)
-    if not known.any():
-        return np.zeros(std.shape)
-    return np.where(known, np.minimum(1.0, np.median(std[known]) / np.where(known, std, 1.0)) ** 2, 0.0)
-
-
 def _course(store: ResultStore, name: str, begun: Sequence[int]) -> Series:
-    """Growth of the pixels that are ok, weighted by their area and by how certain they are."""
+    """Growth of all pixels that are ok, as of one region."""
     _, factor = shown_in(name, store.interval_s)
     noise = RegionNoise.of(store)
     n = len(store.frames)
@@ -143,12 +133,11 @@ def _course(store: ResultStore, name: str, begun: Sequence[int]) -> Series:
         maps = {key: np.where(status == Status.OK, store.read(key, t), np.float32(np.nan)) for key in needed}
         field = Field(maps, status, store.y, store.x, store.frames[t], store.attrs)
         area = surface_area(field)
-        part = {key: values.astype(np.float64) for key, values in maps.items()}
-        weights = np.where(np.isfinite(area), area, 0.0) * certain(part[f"{name}_std"])
-        found = mean_over(name, part, weights, noise)
-        if found:
+        found = region_row(field, area, Coverage.everywhere(field.shape), (name,), noise, t, n)
+        if name in found:
             mean[t], error[t] = found[name], found[f"{name}_se"]
-            spread[:, t] = np.percentile(part[name][np.isfinite(part[name]) & (weights > 0)], (16, 84))
+            known = np.isfinite(area) & np.isfinite(maps[name]) & np.isfinite(maps[f"{name}_std"])
+            spread[:, t] = np.percentile(maps[name][known], (16, 84))
     frames = tuple(noise.frames.tolist())
     return Series(
         quantity_title(name), np.array(store.frames, float), mean * factor, error * factor, spread * factor, frames
