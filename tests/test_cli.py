@@ -58,7 +58,9 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert call("--help") == 0
     text = capsys.readouterr().out
     assert all(f"\n  {name} " in text for name in cli.COMMANDS)
-    assert set(cli.COMMANDS) == {"simulate", "run", "evaluate", "profile", "plan-rig", "check", "info", "demo"}
+    assert set(cli.COMMANDS) == {
+        "simulate", "run", "growth", "regions", "export", "evaluate", "profile", "plan-rig", "check", "info", "demo",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
