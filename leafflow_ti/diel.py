@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 DAY_H = 24.0
 GROWTH = ("growth", "area_rate")
-"""Quantities that can be folded: growth of the refinement or the model, and that of the motion in a window."""
+"""Quantities that can be folded, the preferred one first: growth of the run, and that of the motion in a window."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,20 +62,25 @@ class DielCurves:
         return f"growth by {what}: {bins} bins with values from {span}, up to {days} day{'s' * (days != 1)} in a bin"
 
 
-def fold(table: RegionTable, bin_h: float = 1.0, quantity: str = "growth") -> DielCurves:
+def fold(table: RegionTable, bin_h: float = 1.0, quantity: str | None = None) -> DielCurves:
     """The growth of each region by the time of day, in bins of ``bin_h`` hours that divide the day.
 
-    Hours are those of the column ``clock`` where the table has it, else they count from frame 0.
+    ``quantity``: one of ``GROWTH``, None: the first that the table has. Hours are those of the column ``clock`` where
+    the table has it, else they count from frame 0.
     Raises InputError for a table without growth per hour, UsageError for bins that do not divide the day.
     """
     n_bins = round(DAY_H / bin_h) if bin_h > 0 else 0
     if n_bins < 1 or abs(n_bins * bin_h - DAY_H) > 1e-9 * DAY_H:
         raise UsageError(f"bins of {bin_h:g} h do not divide a day: choose one of .25, .5, 1, 2, 3, 4, 6 h")
-    name, error = f"{quantity}_percent_per_h", f"{quantity}_se_percent_per_h"
-    if name not in table.columns:
+    wanted = GROWTH if quantity is None else (quantity,)
+    found_quantity = next((one for one in wanted if f"{one}_percent_per_h" in table.columns), None)
+    if found_quantity is None:
         raise InputError(
-            f"the regions have no {name}: a diel curve needs a growth rate and the time between frames (interval_s)"
+            f"the regions have no {' or '.join(wanted)} per hour: a diel curve needs a growth rate and the time "
+            "between frames (interval_s)"
         )
+    quantity = found_quantity
+    name, error = f"{quantity}_percent_per_h", f"{quantity}_se_percent_per_h"
     hours, days = _hours(table)
     rows = []
     for region in table.regions:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,26 +58,36 @@ class RegionTable:
         """As a DataFrame; MissingExtra where pandas is not installed."""
         return to_pandas(self.columns)
 
+    @property
+    def growth(self) -> tuple[str, str] | None:
+        """The growth that the table has, ``growth`` or ``area_rate``, and its rate: ``per_h`` where it is known."""
+        found = [(name, rate) for name in ("growth", "area_rate") for rate in ("per_h", "per_frame")]
+        return next((pair for pair in found if f"{pair[0]}_percent_{pair[1]}" in self.columns), None)
+
     def summary(self) -> list[str]:
         """A line per region: pixels, valid share and area of its last frame, mean growth over the frames."""
-        growth = next((n for n in ("growth_percent_per_h", "growth_percent_per_frame") if n in self.columns), None)
-        unit = "%/h" if growth == "growth_percent_per_h" else "%/frame"
-        lines = [f"{'region':>7}{'frames':>8}{'pixels':>9}{'valid':>8}{'area [mm²]':>13}{f'growth [{unit}]':>22}"]
+        title = "" if self.growth is None else f"{self.growth[0].replace('_', ' ')} [{_unit(self.growth[1])}]"
+        lines = [f"{'region':>7}{'frames':>8}{'pixels':>9}{'valid':>8}{'area [mm²]':>13}{title:>22}"]
+        lines += [
+            f"{region:>7}{frames:>8}{pixels:>9}{valid:>8}{area:>13}{growth:>22}"
+            for region, frames, pixels, valid, area, growth in self._rows()
+        ]
+        return [line.rstrip() for line in lines]
+
+    def _rows(self) -> Iterator[tuple[str, ...]]:
+        """The cells of each region in the summary."""
         for region in self.regions:
             rows = self.of(region)
             seen = rows["pixels"] > 0
             area = _last(rows["area_mm2"], seen) if "area_mm2" in rows else np.nan
-            text = "-"
-            if growth is not None:
-                mean, se = over_frames(
-                    rows[growth], rows[growth.replace("_percent", "_se_percent")], self.correlation["growth"]
-                )
-                text = f"{mean:.4g} ± {se:.2g}" if np.isfinite(mean) else "-"
-            lines.append(
-                f"{region:>7}{int(seen.sum()):>8}{_last(rows['pixels'], seen):>9.0f}"
-                f"{_last(rows['valid_share'], seen):>8.0%}{area:>13.5g}{text:>22}"
-            )
-        return lines
+            text = ""
+            if self.growth is not None:
+                name, rate = self.growth
+                values, errors = rows[f"{name}_percent_{rate}"], rows[f"{name}_se_percent_{rate}"]
+                mean, error = over_frames(values, errors, self.correlation.get(name, (1.0,)))
+                text = f"{mean:.4g} ± {error:.2g}" if np.isfinite(mean) else "-"
+            numbers = (f"{_last(rows['pixels'], seen):.0f}", f"{_last(rows['valid_share'], seen):.0%}", f"{area:.5g}")
+            yield (str(region), str(int(seen.sum())), *("-" if "nan" in one else one for one in numbers), text)
 
     def __repr__(self) -> str:
         frames = np.unique(self.columns["frame"])
@@ -85,11 +95,14 @@ class RegionTable:
         return "\n".join([head, *self.summary()])
 
     def _repr_html_(self) -> str:
-        cells = [line.replace(" ± ", "±").split() for line in self.summary()[1:]]
-        unit = "%/h" if "growth_percent_per_h" in self.columns else "%/frame"
-        head = ("region", "frames", "pixels", "valid", "area [mm²]", f"growth [{unit}]")
-        rows = "".join("<tr>" + "".join(f"<td>{c.replace('±', ' ± ')}</td>" for c in row) + "</tr>" for row in cells)
-        return f"<table><thead><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr></thead><tbody>{rows}</tbody></table>"
+        growth = [] if self.growth is None else [f"{self.growth[0].replace('_', ' ')} [{_unit(self.growth[1])}]"]
+        head = "".join(f"<th>{name}</th>" for name in ("region", "frames", "pixels", "valid", "area [mm²]", *growth))
+        rows = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in self._rows())
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+
+
+def _unit(rate: str) -> str:
+    return f"%/{rate.removeprefix('per_')}"
 
 
 def over_frames(values: Floats, errors: Floats, correlation: tuple[float, ...]) -> tuple[float, float]:

@@ -169,6 +169,11 @@ def _with_time(
 
 def _notes(store: ResultStore, noise: RegionNoise) -> tuple[str, ...]:
     notes = []
+    missing = store.n_units - len(store.done())
+    if missing:
+        notes.append(
+            f"{missing} of {store.n_units} units of {store.path} are not done: their pixels count as not valid"
+        )
     if noise.gradient is None:
         notes.append(
             f"{store.path} does not state how errors hang together: standard errors count them as the same throughout "

@@ -123,6 +123,13 @@ def test_light_that_is_none(text: str) -> None:
         parse_light(text)
 
 
+def test_growth_of_the_motion_stands_in() -> None:
+    given = table()
+    columns = {name.replace("growth", "area_rate"): values for name, values in given.columns.items()}
+    curves = fold(RegionTable(columns, correlation={"area_rate": (1.0,)}))
+    np.testing.assert_array_equal(curves.of(1)["area_rate_percent_per_h"], fold(given).of(1)["growth_percent_per_h"])
+
+
 def test_curves_as_csv(tmp_path: Path) -> None:
     path = fold(table()).to_csv(tmp_path / "d.csv")
     lines = path.read_text(encoding="utf-8").splitlines()

@@ -297,7 +297,7 @@ def run_attributes(gauge: Gauge) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def still_plane(tmp_path_factory: pytest.TempPathFactory) -> ResultStore:
-    """Thirty frames of a plane at rest, each with noise of its own, and growth as it follows from the motion."""
+    """Thirty frames of a plane at rest, each with its own noise, and growth as it follows from the motion."""
     gauge = Gauge.of(29, 4)
     noise = NoiseCorrelation(autocorrelation(WINDOW), autocorrelation(WINDOW), np.ones(1))
 
@@ -521,6 +521,12 @@ def test_results_without_an_interval_have_rates_per_frame(tmp_path: Path) -> Non
     assert "growth [%/frame]" in repr(table)
     with pytest.raises(UsageError, match="time between frames is unknown"):
         measure_regions(store, label_image(), start_time="2024-05-31T06:00")
+
+
+def test_a_run_that_goes_on_is_measured_so_far(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "o.zarr", LEAF, leaf_maps())
+    (store.path / "status" / ".done" / "4").unlink()
+    assert "1 of 5 units" in measure_regions(store, label_image()).notes[0]
 
 
 def test_results_of_one_camera_have_flow_and_strain(tmp_path: Path) -> None:

@@ -42,30 +42,24 @@ def _maps(selection: Selection) -> int:
 class Format:
     """A format. ``suffixes``: of its files; ``file``, ``folder``: its writers, as ``module:function`` of this package,
     into one file and into a folder; ``parts``: how many files one file stands for, which it can only if that is 1;
-    ``surface``: needs a depth; ``about``: a line for the help."""
+    ``surface``: whether it needs a depth.
+    """
 
     suffixes: tuple[str, ...]
     file: str | None
     folder: str | None
     parts: _Count
-    surface: bool
-    about: str
+    surface: bool = False
 
 
 FORMATS: dict[str, Format] = {
-    "tiff": Format((".tif", ".tiff"), "tiff:write_imagej_file", "tiff:write_imagej_folder", _maps, False,
-                   "ImageJ and Fiji: a float32 stack per map"),
-    "ome-tiff": Format((".tif", ".tiff"), "tiff:write_ome", None, _one, False,
-                       "Bio-Formats, napari: one file, maps as channels"),
-    "netcdf": Format((".nc",), "netcdf:write_netcdf", None, _one, False,
-                     "CF conventions: MATLAB, R, Panoply, xarray"),
-    "ply": Format((".ply",), "ply:write_ply_file", "ply:write_ply_folder", _frames, True,
-                  "MeshLab, CloudCompare, Blender: a mesh per frame"),
-    "vtk": Format((".vtp",), "vtk:write_vtk_file", "vtk:write_vtk_folder", _frames, True,
-                  "ParaView: a series of meshes with vectors"),
-    "csv": Format((".csv",), "text:write_csv_file", "text:write_csv_folder", _one, False,
-                  "a line per pixel: R, pandas; a folder gets a file per frame"),
-}  # fmt: skip
+    "tiff": Format((".tif", ".tiff"), "tiff:write_imagej_file", "tiff:write_imagej_folder", _maps),
+    "ome-tiff": Format((".tif", ".tiff"), "tiff:write_ome", None, _one),
+    "netcdf": Format((".nc",), "netcdf:write_netcdf", None, _one),
+    "ply": Format((".ply",), "ply:write_ply_file", "ply:write_ply_folder", _frames, surface=True),
+    "vtk": Format((".vtp",), "vtk:write_vtk_file", "vtk:write_vtk_folder", _frames, surface=True),
+    "csv": Format((".csv",), "text:write_csv_file", "text:write_csv_folder", _one),
+}
 """Name -> format."""
 
 
