@@ -74,9 +74,14 @@ class Panel:
     @property
     def kind(self) -> Literal["map", "arrows", "normals", "status"]:
         """What it draws."""
-        if self.key in ("velocity", "flow"):
-            return "arrows"
-        return self.key if self.key in ("normals", "status") else "map"  # type: ignore[return-value]
+        match self.key:
+            case "velocity" | "flow":
+                return "arrows"
+            case "normals":
+                return "normals"
+            case "status":
+                return "status"
+        return "map"
 
     @property
     def needs(self) -> tuple[str, ...]:

@@ -176,7 +176,7 @@ def test_page_is_the_same_twice(tmp_path: Path) -> None:
 
 def test_large_results_stay_below_the_limit(tmp_path: Path) -> None:
     """Noise in every map, as hardly compresses, and more frames than are shown."""
-    store = make_store(tmp_path / "s.zarr", frames=range(13), size=(300, 400), noise=0.3)
+    store = make_store(tmp_path / "s.zarr", frames=range(13), size=(200, 260), noise=0.3)
     page = write_report(store, tmp_path / "page.html")
     assert 0.3 * LIMIT < page.stat().st_size <= LIMIT
     data = data_of(page.read_text(encoding="utf-8"))

@@ -6,6 +6,7 @@ integration sets.
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -49,8 +50,6 @@ def seen(page: Page) -> np.ndarray:
     uri = page.ask(
         f"new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done({CANVAS}.toDataURL()))))"
     )
-    import base64
-
     return pixels_of(base64.b64decode(uri.partition(",")[2]))
 
 

@@ -95,11 +95,12 @@ def report_page(store: ResultStore, regions: RegionCurves | None, title: str, fr
     thin = _finest(store, len(indices))
     while True:
         page = _page(store, facts, regions, title, Shown.of(store, indices, thin))
-        if len(page.encode()) <= LIMIT:
+        size = len(page.encode())
+        if size <= LIMIT:
             return page
         if thin >= max(store.x.size, store.y.size):
             raise RunError(f"{store.path}: the report exceeds {LIMIT} bytes even without maps: show fewer --frames")
-        thin = max(thin + 1, round(1.25 * thin))
+        thin = max(thin + 1, round(thin * (size / LIMIT) ** 0.5))
 
 
 def _finest(store: ResultStore, n_frames: int) -> int:

@@ -17,9 +17,9 @@ uniform sampler2D colours; uniform vec4 paint;
 out vec4 colour;
 void main() {
   vec4 seen = paint.a > 0.5 ? paint : texture(colours, at);
-  if (seen.a < 0.5) seen = vec4(0.62, 0.64, 0.63, 1.0);
+  if (seen.a < 0.5) seen = vec4(0.62, 0.64, 0.63, 1.0); // no value
   float light = length(facing) > 0.0 ? abs(dot(normalize(facing), normalize(vec3(-0.3, 0.45, 0.85)))) : 1.0;
-  colour = vec4(seen.rgb * (0.68 + 0.32 * light), 1.0);
+  colour = vec4(seen.rgb * (0.68 + 0.32 * light), seen.a);
 }`;
 
 /** Vertices of a frame in space, and where they lie in its images. */
@@ -183,20 +183,33 @@ class SurfaceView {
     gl.uniform1f(uniform.swell, 0);
     gl.bindVertexArray(this.mesh.array);
     gl.drawElements(gl.TRIANGLES, this.indices, gl.UNSIGNED_INT, 0);
-    if (this.withArrows && this.corners) {
-      gl.bindVertexArray(this.shafts.array);
-      gl.enable(gl.CULL_FACE);
-      // Dark arrows with a light rim, the inside of slightly thicker ones, are seen on any colour.
-      for (const [grey, side, swell] of [[1.35, gl.FRONT, 0.003 * this.radius / Math.sqrt(this.magnify)], [0.12, gl.BACK, 0]]) {
-        gl.cullFace(side);
-        gl.uniform1f(uniform.swell, swell);
-        gl.uniform4f(uniform.paint, grey, grey, grey, 1);
-        gl.drawArrays(gl.TRIANGLES, 0, this.corners);
-      }
-      gl.disable(gl.CULL_FACE);
-    }
+    if (this.withArrows && this.corners) this.drawArrows();
     gl.bindVertexArray(null);
     this.onDraw(this);
+  }
+
+  /** Dark arrows with a light rim, which is the inside of slightly thicker ones; faint where the surface hides them. */
+  drawArrows() {
+    const { gl, uniform } = this, rim = (0.003 * this.radius) / Math.sqrt(this.magnify);
+    const pass = (grey, opacity, side, swell) => {
+      gl.cullFace(side);
+      gl.uniform1f(uniform.swell, swell);
+      gl.uniform4f(uniform.paint, grey, grey, grey, opacity);
+      gl.drawArrays(gl.TRIANGLES, 0, this.corners);
+    };
+    gl.bindVertexArray(this.shafts.array);
+    gl.enable(gl.CULL_FACE);
+    gl.enable(gl.BLEND);
+    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.depthMask(false);
+    gl.depthFunc(gl.GREATER);
+    pass(0.12, 0.55, gl.BACK, 0);
+    gl.depthMask(true);
+    gl.depthFunc(gl.LESS);
+    gl.disable(gl.BLEND);
+    pass(1.35, 1, gl.FRONT, rim);
+    pass(0.12, 1, gl.BACK, 0);
+    gl.disable(gl.CULL_FACE);
   }
 
   turnBy(dx, dy) {
