@@ -1,7 +1,8 @@
 """Material followed over 60 frames: where the points end, and how much their surface has grown, against exact scenes.
 
 Once on the exact maps of every frame, which tests the tracking alone, and once on what is measured in images with
-noise, rounded to 8 bits. Places, growth and strain of the scenes' material are exact at any time.
+noise, rounded to 8 bits. Places, growth and strain of the scenes' material are exact at any time. Points are those whose window
+shows one surface alone in the first frame.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from leafflow_ti.synthetic.scene import render_image
 from leafflow_ti.tracking import track
 from leafflow_ti.tracks import Tracks
 from perf.cases import Options
-from perf.exact_stores import Array, Scene, exact_maps, exact_store, pixels, seen
+from perf.exact_stores import Array, Scene, exact_maps, exact_store, pixels, seen, surface_number
 from perf.figures import Figure, Outcome
 
 DRIFT_PX, GROWTH_PERCENT = 0.05, 1.0
@@ -41,7 +42,7 @@ class Settings:
     frames: int = 60
     noise: float = 1.0
     window: int = 33
-    stride: int = 6
+    stride: int = 10
 
     def scenes(self) -> dict[str, Scene]:
         """The scenes, as long as they are to be."""
@@ -104,10 +105,17 @@ def measured_store(scene: Scene, path: Path, settings: Settings) -> ResultStore:
     return ResultStore.open(path)
 
 
-def followed(store: ResultStore) -> Tracks:
-    """All pixels with the status ok of the first frame, followed to the last."""
+def followed(scene: Scene, store: ResultStore, window: int) -> Tracks:
+    """All pixels with the status ok of the first frame whose window shows one surface alone, followed to the last."""
     rows, cols = np.nonzero(store.read("status", 0) == Status.OK)
-    return track(store, store.x[cols], store.y[rows])
+    x, y = store.x[cols].astype(float), store.y[rows].astype(float)
+    t, half = scene.time(store.frames[0]), window // 2
+    ends = [np.clip(at + by, 0, n - 1) for at, n in ((x, scene.size[0]), (y, scene.size[1])) for by in (-half, half)]
+    here = surface_number(scene, x, y, t)
+    inner = here > 0
+    for one, two in ((ends[0], y), (ends[1], y), (x, ends[2]), (x, ends[3])):
+        inner &= surface_number(scene, one, two, t) == here
+    return track(store, x[inner], y[inner])
 
 
 def figures(name: str, e: Errors) -> list[Figure]:
@@ -149,9 +157,9 @@ def measure(settings: Settings) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         for number, (name, scene) in enumerate(settings.scenes().items()):
             store = exact_store(scene, Path(folder) / f"exact-{number}.zarr", settings.measured, settings.stride)
-            found += figures(f"{name}, exact maps", errors(scene, store, followed(store)))
+            found += figures(f"{name}, exact maps", errors(scene, store, followed(scene, store, settings.window)))
             store = measured_store(scene, Path(folder) / f"measured-{number}.zarr", settings)
-            e = errors(scene, store, followed(store))
+            e = errors(scene, store, followed(scene, store, settings.window))
             found += [*figures(f"{name}, images", e), *noise_figures(f"{name}, images", e)]
     shown = {name: f"{scene.size[0]} x {scene.size[1]} px, {scene.n_cols} cameras, {scene.n_frames} images each"
              for name, scene in settings.scenes().items()}  # fmt: skip
