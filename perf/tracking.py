@@ -1,8 +1,8 @@
 """Material followed over 60 frames: where the points end, and how much their surface has grown, against exact scenes.
 
 Once on the exact maps of every frame, which tests the tracking alone, and once on what is measured in images with
-noise, rounded to 8 bits. Places, growth and strain of the scenes' material are exact at any time. Points are those whose window
-shows one surface alone in the first frame.
+noise, rounded to 8 bits. Places, growth and strain of the scenes' material are exact at any time. Points are those
+whose window shows one surface alone in the first and in the last frame.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from leafflow_ti.capture import Geometry, capture_from_array
 from leafflow_ti.cumulative import track_growth
@@ -106,16 +107,27 @@ def measured_store(scene: Scene, path: Path, settings: Settings) -> ResultStore:
 
 
 def followed(scene: Scene, store: ResultStore, window: int) -> Tracks:
-    """All pixels with the status ok of the first frame whose window shows one surface alone, followed to the last."""
+    """All pixels with the status ok of the first frame, followed to the last; of these, points whose window shows one
+    surface alone in both."""
     rows, cols = np.nonzero(store.read("status", 0) == Status.OK)
     x, y = store.x[cols].astype(float), store.y[rows].astype(float)
-    t, half = scene.time(store.frames[0]), window // 2
-    ends = [np.clip(at + by, 0, n - 1) for at, n in ((x, scene.size[0]), (y, scene.size[1])) for by in (-half, half)]
-    here = surface_number(scene, x, y, t)
-    inner = here > 0
-    for one, two in ((ends[0], y), (ends[1], y), (x, ends[2]), (x, ends[3])):
-        inner &= surface_number(scene, one, two, t) == here
-    return track(store, x[inner], y[inner])
+    begin, end = (scene.time(store.frames[k]) for k in (0, -1))
+    tracks = track(store, x, y)
+    last = pixels(scene, scene.follow(seen(scene, x, y, begin), end, begin))
+    return tracks.chosen(_alone(scene, x, y, begin, window // 2) & _alone(scene, *last, end, window // 2))
+
+
+def _alone(scene: Scene, x: Array, y: Array, t: float, half: int) -> NDArray[np.bool_]:
+    """Which of the image positions [n] have the same surface ``half`` px around them, as far as the image goes."""
+
+    def surface(dx: int, dy: int) -> NDArray[np.int64]:
+        places = (np.clip(np.rint(np.nan_to_num(at + by)), 0, n - 1) for at, by, n in
+                  ((x, dx, scene.size[0]), (y, dy, scene.size[1])))  # fmt: skip
+        return surface_number(scene, *places, t)
+
+    here = surface(0, 0)
+    around = ((half, 0), (-half, 0), (0, half), (0, -half))
+    return np.asarray((here > 0) & np.all([surface(*by) == here for by in around], axis=0))
 
 
 def figures(name: str, e: Errors) -> list[Figure]:
@@ -172,7 +184,7 @@ def run(options: Options) -> Outcome:
     leaf = LeafScene(
         size=(281, 221), half_mm=(4.2, 3.2), n_cols=5, velocity=(0.015, -0.012, 0.02), omega=(0.0015, 0.002, 0.0015)
     )
-    cube = CubeScene(size=(221, 151), n_cols=5, velocity=(0.0, 0.0, 0.0), supersampling=3)
+    cube = CubeScene(size=(321, 121), n_cols=5, velocity=(0.0, 0.0, 0.0), supersampling=3)
     settings = Settings(leaf, cube)
     if options.quick:
         leaf = replace(leaf, size=(141, 121), half_mm=(3.0, 2.4), supersampling=2)
