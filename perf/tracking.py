@@ -180,14 +180,12 @@ def measure(settings: Settings) -> Outcome:
 
 
 def run(options: Options) -> Outcome:
-    """The case; quick: a few frames of small images."""
+    """The case; quick: a few frames."""
     leaf = LeafScene(
         size=(281, 221), half_mm=(4.2, 3.2), n_cols=5, velocity=(0.015, -0.012, 0.02), omega=(0.0015, 0.002, 0.0015)
     )
     cube = CubeScene(size=(321, 121), n_cols=5, velocity=(0.0, 0.0, 0.0), supersampling=3)
     settings = Settings(leaf, cube)
     if options.quick:
-        leaf = replace(leaf, size=(141, 121), half_mm=(3.0, 2.4), supersampling=2)
-        cube = replace(cube, size=(141, 81), supersampling=2)
-        settings = Settings(leaf, cube, frames=4, stride=12)
+        settings = replace(settings, leaf=replace(leaf, supersampling=2), cube=replace(cube, supersampling=2), frames=4)
     return measure(settings)
