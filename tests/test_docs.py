@@ -120,6 +120,14 @@ def test_every_page_is_in_the_contents() -> None:
     assert sorted(listed) == sorted(page.stem for page in PAGES if page.stem != "index"), index
 
 
+def test_links_of_the_readme_lead_somewhere() -> None:
+    """Those of the site's pages are checked while it is built."""
+    links = re.findall(r"\]\(([^)#]+)(?:#[\w-]+)?\)", README.read_text(encoding="utf-8"))
+    local = [link for link in links if not link.startswith("https:")]
+    assert len(local) > 10
+    assert [link for link in local if not (ROOT / link).is_file()] == []
+
+
 def test_public_names_have_documentation() -> None:
     assert all(getattr(leafflow_ti, name).__doc__ for name in leafflow_ti.__all__)
 
