@@ -14,8 +14,10 @@ slides from one surface to another. That distance is the *closure*, what is left
 steps and returning by the second; the track runs between the two. Half of it is added to the bound. Where no
 acceleration is measured, it is the change of the motion since the frame before.
 
-**Between output pixels** the motion is taken as bilinear; what its second differences say to that, along the way, is
-the third part of the bound.
+**Curvature.** The motion is a mean over a window, and between output pixels a mean of four. By how much either is off
+where the motion changes other than linearly, its second differences say; what that adds up to along the way is the
+third part of the bound. A turning leaf is found to move too little or too much by that: the window takes its curved
+surface for a plane a little beside it.
 
 A stretch of the image along the way, which stretches an error with it, is not counted, nor is what all frames have in
 common: a calibration that is off, light that moves with the leaf.
@@ -76,7 +78,7 @@ def closure(motion: Floats, acceleration: Floats, steps: Floats) -> Floats:
 
 
 def bent(bend: Floats, steps: Floats) -> Floats:
-    """Distance [S, n] px that adds up between output pixels, by the ``bend`` [S, 2, n] px/frame of ``Samples``."""
+    """Distance [S, n] px that the curvature of the motion adds up to, by the ``bend`` [S, 2, n] px/frame of samples."""
     total = np.zeros(bend.shape)
     total[1:] = np.cumsum(0.5 * steps[:, None, None] * (bend[1:] + bend[:-1]), axis=0)
     return np.asarray(np.hypot(total[:, 0], total[:, 1]))

@@ -34,7 +34,7 @@ errors would turn into NaN when they are summed."""
 class Samples:
     """What n points find in a frame: ``motion`` [2, n] px/frame with its standard error ``std``, ``acceleration``
     [2, n] px/frame² (NaN where it is not measured), ``depth`` [n] mm (NaN without depth). ``bend`` [2, n] px/frame: by
-    how much the motion's second differences say that its bilinear mean is off."""
+    how much the motion's second differences say that its bilinear mean is off, and the mean over a window."""
 
     motion: Floats
     std: Floats
@@ -48,10 +48,13 @@ class Samples:
 
 
 class FrameAtPoints:
-    """The maps of one frame, to be read at image positions."""
+    """The maps of one frame, to be read at image positions.
 
-    def __init__(self, lattice: Lattice, surface: Surface, stack: Floats):
-        self._lattice, self._surface, self._stack = lattice, surface, stack
+    ``spread`` [2]: second moments of a window along x and y, in squared steps of the lattice.
+    """
+
+    def __init__(self, lattice: Lattice, surface: Surface, stack: Floats, spread: tuple[float, float]):
+        self._lattice, self._surface, self._stack, self._spread = lattice, surface, stack, spread
         self._bends = second_differences(stack[:2], surface)
 
     def reading(self, at: Floats) -> NDArray[np.uint8]:
@@ -67,8 +70,8 @@ class FrameAtPoints:
         cells = Cells.at(self._lattice, *at)
         found = cells.mean(self._stack)
         bend = sum(
-            0.5 * part * (1 - part) * cells.mean(values)
-            for part, values in zip((cells.right, cells.down), self._bends, strict=True)
+            0.5 * (part * (1 - part) + spread) * cells.mean(values)
+            for part, spread, values in zip((cells.right, cells.down), self._spread, self._bends, strict=True)
         )
         with np.errstate(divide="ignore"):
             return Samples(found[:2], found[2:4], found[4:6], 1 / found[6], np.asarray(bend))
@@ -76,14 +79,14 @@ class FrameAtPoints:
 
 @dataclass(frozen=True, eq=False)
 class PointMaps:
-    """The maps of a store that points need. ``correlation`` [L]: of the motion's errors 0, 1, 2, ... frames apart."""
+    """The maps of a store that points need. ``noise``: how the errors of its motion hang together."""
 
     store: ResultStore
     lattice: Lattice
     f_px: float
     principal: Floats  # [2] px
     names: tuple[str, ...]
-    correlation: Floats
+    noise: NoiseCorrelation
 
     @classmethod
     def of(cls, store: ResultStore) -> PointMaps:
@@ -105,7 +108,7 @@ class PointMaps:
             float(plan["f_px"]),
             np.array(plan["principal_px"], float),
             tuple(name for name in wanted if name in has),
-            NoiseCorrelation.of(store).t,
+            NoiseCorrelation.of(store),
         )
 
     def frame(self, index: int) -> FrameAtPoints:
@@ -117,7 +120,8 @@ class PointMaps:
         known = measured & finite([*image[:2], *([depth] if "depth" in maps else [])])
         with np.errstate(divide="ignore"):
             stack = np.concatenate([image, 1 / depth[None]])
-        return FrameAtPoints(self.lattice, Surface(known, self._joined(maps)), stack)
+        spread = window_moment(self.noise.x), window_moment(self.noise.y)
+        return FrameAtPoints(self.lattice, Surface(known, self._joined(maps)), stack, spread)
 
     def in_space(self, at: Floats, depth: Floats) -> Floats:
         """Positions [..., n, 3] mm of the image positions ``at`` [..., 2, n] px at the depths [..., n] mm."""
@@ -164,3 +168,11 @@ class PointMaps:
         points = np.moveaxis(np.concatenate([self._rays(), np.ones((1, *maps["depth"].shape))]), 0, -1)
         slopes = (maps[SLOPES[0]], maps[SLOPES[1]]) if all(name in maps for name in SLOPES) else None
         return Neighbours(points * maps["depth"][..., None], slopes, JUMP).joined
+
+
+def window_moment(correlation: Floats) -> float:
+    """Second moment of a window, from the ``correlation`` of errors at 0, 1, 2, ... steps: the window's with itself, of
+    twice the moment."""
+    distance = np.arange(len(correlation))
+    both = np.where(distance > 0, 2.0, 1.0) * correlation
+    return float(0.5 * np.sum(both * distance**2) / np.sum(both))

@@ -3,9 +3,11 @@
 Means are over the pixels with the status ``ok``, weighted by the area of the surface that a pixel sees; pixels less
 certain than most count less. ``area`` is the sum over these pixels divided by their share of the region's pixels (the
 valid share): what was not measured counts as like the rest; ``area_measured`` is the sum itself.
-Standard errors (``_se``) are those of the mean, from the pixels' own and the correlation between them (``region_noise``): noise of the images, not how a label is drawn; ``_sd`` is the
-standard deviation between the pixels of the region. Rates come per frame and, where the time between frames is known,
-per hour. Axes: X right, Y down, Z away from the camera; ``tilt`` is the angle between the normal and the camera's axis.
+
+Standard errors (``_se``) are those of the mean, from the pixels' own and the correlation between them
+(``region_noise``): noise of the images, not how a label is drawn; ``_sd`` is the standard deviation between the pixels
+of the region. Rates come per frame and, where the time between frames is known, per hour. Axes: X right, Y down, Z away
+from the camera; ``tilt`` is the angle between the normal and the camera's axis.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ class _Way:
         )
         steps = np.diff(clock[order])
         apart = closure(motion, acceleration, steps)
-        drift = noise(std, maps.correlation, steps) + 0.5 * apart + bent(bend, steps)
+        drift = noise(std, maps.noise.t, steps) + 0.5 * apart + bent(bend, steps)
         with np.errstate(invalid="ignore"):
             lost = np.logical_or.accumulate(drift > max_drift, axis=0)
         status[lost.any(axis=0)] = TrackStatus.DRIFTED

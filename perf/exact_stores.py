@@ -41,6 +41,13 @@ def seen(scene: Scene, x: Array, y: Array, t: float) -> Array:
     return np.asarray(depth[..., None] * rays)
 
 
+def surface_number(scene: Scene, x: Array, y: Array, t: float) -> NDArray[np.int64]:
+    """Which smooth surface the middle camera sees at whole pixels ``x``, ``y`` [...] of the image; 0: none."""
+    if isinstance(scene, CubeScene):
+        return cube.truth(_turned(scene, t))["face"][y.astype(int), x.astype(int)].astype(np.int64)
+    return np.isfinite(seen(scene, x, y, t)[..., 2]).astype(np.int64)
+
+
 def _turned(scene: CubeScene, t: float) -> CubeScene:
     """The scene whose frame in the middle is that at ``t``."""
     rotation, shift = scene.pose(t)

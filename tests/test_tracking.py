@@ -299,3 +299,17 @@ def test_rays_of_the_plane_are_those_of_its_pixels() -> None:
     back = pixels(PLANE, seen(PLANE, x, y, 4.0))
     np.testing.assert_allclose(back, (x, y), atol=1e-9)
     assert rays_of(x, y).shape == (2, 2, 3)
+
+
+def test_what_a_window_takes_from_a_bent_motion_is_in_the_bound(tmp_path: Path) -> None:
+    """Motion that grows with the square of x: its mean over a Gaussian window is off by σ² times the coefficient."""
+    store, maps, status = flat_store(tmp_path / "o.zarr", n=6, flow=(0.0, 0.0), std=1e-9)
+    sigma, coefficient = 5.0, 1e-4
+    maps["flow_x"][:] = coefficient * (store.x - 20.0) ** 2
+    distance = np.arange(0, 40)
+    plan = store.attrs["plan"]
+    plan["noise_correlation"]["x"] = np.exp(-(distance**2) / (4 * sigma**2)).tolist()
+    store.update_attrs({"plan": plan})
+    fill(store, maps, status)
+    tracks = track(store, [20.0], [14.0])
+    np.testing.assert_allclose(tracks.drift[:, 0], sigma**2 * coefficient * np.arange(6), rtol=0.01, atol=1e-6)

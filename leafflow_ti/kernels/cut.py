@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
-from leafflow_ti.kernels.group import region
+from leafflow_ti.kernels.group import planes_loader, region
 from leafflow_ti.kernels.spec import KernelSpec
 from leafflow_ti.kernels.workspace import Number, Region, Value
 
@@ -22,21 +22,8 @@ XX, XXX = 3, 6
 @functools.cache
 def cut_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stage ``cut_windows``; ``equation_noise`` and ``of_image_square`` for that of the covariances."""
-    precise, lanes, V = spec.precise, spec.lanes, spec.element
-    small = dense(spec)
-
-    @ti.func
-    def load_moments(p: ti.template(), number: ti.template(), ws: ti.template(), J: ti.template()):
-        """MASK: the moments of the group's pixels."""
-        for k in range(number[p.n + Number.MASK_PLANES]):
-            begin = (number[p.n + Number.MASK_PLANE] + k) * p.n_pixels + p.pixel
-            element = V(0.0)
-            if ti.static(lanes == 1):
-                element = ti.cast(J[begin], precise)
-            else:
-                for i in ti.static(range(lanes)):
-                    element[i] = ti.cast(J[begin + i], precise)
-            ws[region(p, number, Region.MASK) + k * p.stride] = element
+    precise, V = spec.precise, spec.element
+    small, load_planes = dense(spec), planes_loader(spec)
 
     @ti.func
     def noise(cut: ti.template(), p: ti.template(), number: ti.template(), value: ti.template(), ws: ti.template()):
@@ -176,7 +163,10 @@ def cut_stages(spec: KernelSpec) -> SimpleNamespace:
         cut = ws[region(p, number, Region.CUT)] > V(0.5)
         ws[region(p, number, Region.ACTIVE)] = ws[region(p, number, Region.CUT)]
         if small.any_lane(cut) == 1:
-            load_moments(p, number, ws, J)
+            load_planes(
+                number[p.n + Number.MASK_PLANE], number[p.n + Number.MASK_PLANES], region(p, number, Region.MASK), p,
+                ws, J,
+            )  # fmt: skip
             noise(cut, p, number, value, ws)
             shapes(cut, p, number, value, ws)
             curved(cut, p, number, value, ws)

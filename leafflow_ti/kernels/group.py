@@ -37,6 +37,29 @@ def region(p: ti.template(), number: ti.template(), name: ti.template()) -> ti.i
 
 
 @functools.cache
+def planes_loader(spec: KernelSpec):
+    """A function: so many planes of the tensors, from the ``first`` on, of the group's pixels into the workspace at
+    ``target``, in the precision of the algebra."""
+    precise, lanes, V = spec.precise, spec.lanes, spec.element
+
+    @ti.func
+    def load_planes(
+        first: ti.i32, count: ti.i32, target: ti.i32, p: ti.template(), ws: ti.template(), J: ti.template()
+    ):
+        for k in range(count):
+            begin = (first + k) * p.n_pixels + p.pixel
+            element = V(0.0)
+            if ti.static(lanes == 1):
+                element = ti.cast(J[begin], precise)
+            else:
+                for i in ti.static(range(lanes)):
+                    element[i] = ti.cast(J[begin + i], precise)
+            ws[target + k * p.stride] = element
+
+    return load_planes
+
+
+@functools.cache
 def group_kernel(spec: KernelSpec, stages: tuple):
     """A kernel: the stages ``(p, number, value, ws, J, out)`` that the steps name, for every group of a batch.
 

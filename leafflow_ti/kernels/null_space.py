@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import ti
-from leafflow_ti.kernels.group import region
+from leafflow_ti.kernels.group import planes_loader, region
 from leafflow_ti.kernels.identify import identify_functions
 from leafflow_ti.kernels.spec import EXTRA_PLANES, KernelSpec
 from leafflow_ti.kernels.texture import texture_functions
@@ -28,7 +28,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     """The stages ``load``, ``scale``, ``least_squares``, ``factorise``, ``accept``, ``inverse_iteration``, ``jacobi``,
     ``parameters``, ``residuals`` and ``centre``; and what stages of weighted windows share with them: ``keep``,
     ``left_out``, ``unsolved``."""
-    precise, lanes, V = spec.precise, spec.lanes, spec.element
+    precise, V, load_planes = spec.precise, spec.element, planes_loader(spec)
     small, identify, texture = dense(spec), identify_functions(spec), texture_functions(spec)
 
     @ti.func
@@ -38,16 +38,7 @@ def null_space_stages(spec: KernelSpec) -> SimpleNamespace:
     ):  # fmt: skip
         """The tensor's distinct entries and what stands behind them, in the precision of the algebra."""
         moments = region(p, number, Region.MOMENTS)
-        first = number[p.n + Number.FIRST_PLANE]
-        for k in range(number[p.n + Number.EXTRA] + EXTRA_PLANES):
-            begin = (first + k) * p.n_pixels + p.pixel
-            element = V(0.0)
-            if ti.static(lanes == 1):
-                element = ti.cast(J[begin], precise)
-            else:
-                for i in ti.static(range(lanes)):
-                    element[i] = ti.cast(J[begin + i], precise)
-            ws[moments + k * p.stride] = element
+        load_planes(number[p.n + Number.FIRST_PLANE], number[p.n + Number.EXTRA] + EXTRA_PLANES, moments, p, ws, J)
         ws[region(p, number, Region.CONVERGED)] = V(0.0)
         ws[region(p, number, Region.ACTIVE)] = V(1.0)
         if ti.static(spec.cut):
