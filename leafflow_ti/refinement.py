@@ -44,8 +44,9 @@ class Place:
 
 
 def refine_maps(
-    stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place, steps: int | None = None
-) -> Effort:
+    stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place, steps: int | None = None,
+    curvature: Array | None = None, wanted: NDArray[np.bool_] | None = None,
+) -> Effort:  # fmt: skip
     """Refine every pixel whose status is ok and whose depth is known, in place of ``maps`` [rows, cols] and ``status``;
     returns what it took.
 
@@ -54,19 +55,23 @@ def refine_maps(
     between surfaces (``support`` below 1): the refinement takes all of the window as one, and would mix them again.
     ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at. Of a
     ``flat`` patch it is the flow that must be known, not the depth. ``steps``: at most so many; None: as planned.
+    ``curvature`` [rows, cols, 3]: that of the surface, see ``surface_curvature``; None: planes. ``wanted``: pixels that
+    matter; None: all.
     """
     if "support" in maps:
         status[(status == Status.OK) & (maps["support"] < 1)] = Status.UNREFINED
-    rows, cols = np.nonzero(refined_from(plan, maps, status))
+    begun = refined_from(plan, maps, status)
+    rows, cols = np.nonzero(begun if wanted is None else begun & wanted)
     if not rows.size:
         return Effort()
     start = _starts(plan, {name: maps[name][rows, cols] for name in starting(plan) if name in maps}, rows.size)
-    found = _call(stage, place, rows, cols, start, steps)
+    bent = None if curvature is None else curvature[rows, cols]
+    found = _call(stage, place, rows, cols, start, steps, bent)
     good, effort = found.converged, found.effort
     parameters, covariance = found.parameters, found.covariance
     again, begin = _neighbours(plan, rows, cols, found, place, status.shape)
     if again.size:
-        second = _call(stage, place, rows[again], cols[again], begin, steps)
+        second = _call(stage, place, rows[again], cols[again], begin, steps, None if bent is None else bent[again])
         effort += second.effort
         better = again[second.converged]
         parameters[better], covariance[better] = (
@@ -140,12 +145,12 @@ def _starts(plan: Refinement, maps: Maps, n: int) -> Array:
 
 
 def _call(
-    stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array, steps: int | None = None
+    stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array, steps: int | None, curvature: Array | None
 ) -> Refined:
     y, x = np.array(place.y)[rows] - place.corner[0], np.array(place.x)[cols] - place.corner[1]
     # A flat patch is the same anywhere in the image; from its own pixel its lengths stay small.
     at = np.zeros((len(y), 2)) if stage.plan.flat else place.rays(rows, cols)
-    return stage(y, x, at, start, steps)
+    return stage(y, x, at, start, steps, curvature)
 
 
 def _neighbours(
