@@ -6,8 +6,8 @@ The refinement takes the surface in a window for
 
 and has Z0 and η among its unknowns, but not K: that is known well enough beforehand. ``g = η / Z = -∂(1/Z)/∂(x, y)`` is
 constant on a plane, so ``K = Z0 ∂g/∂(x, y)`` vanishes there, however it is tilted. A plane is fitted to g over pixels
-around, as many as make up some window of the refinement, weighted by their standard errors; pixels of another surface,
-beyond a jump of depth, do not count.
+around, somewhat beyond the refinement's window, weighted by their standard errors; pixels of another surface, beyond a
+jump of depth, do not count. What does not stand out from noise is left out.
 """
 
 from __future__ import annotations
@@ -29,10 +29,14 @@ Array = NDArray[np.float64]
 SLOPES = ("slope_x", "slope_y")
 INPUTS = ("depth", *SLOPES, *(f"{name}_std" for name in SLOPES))
 """Maps that it follows from."""
-REACH = 1.5
-"""Farthest pixel along an axis, in σ of the refinement's window: what a window weighs at .3 of its middle."""
-ACROSS = 7
+REACH = 2.5
+"""Farthest pixel along an axis, in σ of the refinement's window. A curvature is noisier by the square of what this is
+smaller, and that of a leaf changes over larger distances."""
+ACROSS = 9
 """Pixels along a side of what is fitted, at most: their windows overlap much."""
+INFLATION = 17.0
+"""Variance that is taken for noise, beside that of independent pixels: at least twice what simulated planes show, 2 to
+8 times, the more the windows of neighbours overlap. A curvature counts as far as it stands out: on planes hardly."""
 LEAST_SPREAD = 0.1
 """Smaller principal moment of the pixels around, in squared distances of neighbours: less is a line."""
 
@@ -70,18 +74,21 @@ def surface_curvature(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         steep = f * depth * (1 - zx * rx - zy * ry)
         values = np.stack([zx / steep, zy / steep])
-        weight = 1 / (std[0] ** 2 + std[1] ** 2)
+        weight = 2 * steep**2 / (std[0] ** 2 + std[1] ** 2)
     known = (status == Status.OK) & np.isfinite(values).all(axis=0) & np.isfinite(weight) & (weight > 0)
     values, weight = np.where(known, values, 0.0), np.where(known, weight, 0.0)
     points = np.where(known, depth, np.nan)[..., None] * np.stack([rx, ry, np.ones_like(rx)], axis=-1)
-    gradient = _fitted(values, weight, Neighbours(points, (zx, zy)), around)
+    gradient, variance = _fitted(values, weight, Neighbours(points, (zx, zy)), around)
     K = np.stack([gradient[0, 0], 0.5 * (gradient[0, 1] + gradient[1, 0]), gradient[1, 1]], axis=-1)
-    return np.where(known[..., None], depth[..., None] * K, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        noise = INFLATION * variance / (K[..., 0] ** 2 + 2 * K[..., 1] ** 2 + K[..., 2] ** 2)
+    kept = np.where(noise < 1, 1 - noise, 0.0)
+    return np.where(known[..., None], (kept * depth)[..., None] * K, 0.0)
 
 
-def _fitted(values: Array, weight: Array, neighbours: Neighbours, around: Around) -> Array:
-    """Gradients [2, 2 (x, y), h, w] per px of planes fitted to ``values`` [2, h, w] around each pixel; 0 where they are
-    not determined."""
+def _fitted(values: Array, weight: Array, neighbours: Neighbours, around: Around) -> tuple[Array, Array]:
+    """Gradients [2, 2 (x, y), h, w] per px of planes fitted to ``values`` [2, h, w] around each pixel, 0 where they are
+    not determined; and the mean [h, w] of ``xx² + 2 xy² + yy²`` of their symmetric part that independent noise gives."""
     h, w = weight.shape
     total = np.zeros((6, h, w))  # of 1, x, y, xx, xy, yy
     moments = np.zeros((3, 2, h, w))  # of the values, times 1, x, y
@@ -101,7 +108,8 @@ def _fitted(values: Array, weight: Array, neighbours: Neighbours, around: Around
         det = xx * yy - xy * xy
         found = np.stack([(yy * x - xy * y) / det, (xx * y - xy * x) / det], axis=1)
         determined = det > LEAST_SPREAD * around.pitch**2 * (xx + yy)
-    return np.where(determined, found, 0.0)
+        variance = 1.5 * (xx + yy) / (n * det)
+    return np.where(determined, found, 0.0), np.where(determined, variance, np.inf)
 
 
 def _overlap(h: int, w: int, dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:

@@ -170,10 +170,10 @@ class Plan:
         """Output pixels around a band, and around the region, that are computed for the sake of those inside.
 
         A pixel's growth is seen in its neighbours' velocities, and its refinement may start from theirs; the curvature
-        of the surface is seen in the slopes around.
+        of the surface is seen in the slopes around either.
         """
         near = int(self.differences or self.refine is not None)
-        return max(near, self.around_curved.reach) if self.around_curved else near
+        return near + self.around_curved.reach if self.around_curved else near
 
     @property
     def around_curved(self) -> Around | None:
