@@ -88,7 +88,7 @@ def surface_curvature(
 
 def _fitted(values: Array, weight: Array, neighbours: Neighbours, around: Around) -> tuple[Array, Array]:
     """Gradients [2, 2 (x, y), h, w] per px of planes fitted to ``values`` [2, h, w] around each pixel, 0 where they are
-    not determined; and the mean [h, w] of ``xx² + 2 xy² + yy²`` of their symmetric part that independent noise gives."""
+    not determined; and the mean [h, w] of ``xx² + 2 xy² + yy²`` of their symmetric part from independent noise."""
     h, w = weight.shape
     total = np.zeros((6, h, w))  # of 1, x, y, xx, xy, yy
     moments = np.zeros((3, 2, h, w))  # of the values, times 1, x, y

@@ -60,8 +60,8 @@ def refine_maps(
     between surfaces (``support`` below 1): the refinement takes all of the window as one, and would mix them again.
     ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at. Of a
     ``flat`` patch it is the flow that must be known, not the depth. ``steps``: at most so many; None: as planned.
-    ``curvature`` [rows, cols, 3]: that of the surface, see ``surface_curvature``, which is taken unless a plane explains
-    the images better; None: planes. ``wanted``: pixels that matter; None: all.
+    ``curvature`` [rows, cols, 3]: that of the surface, see ``surface_curvature``, taken unless a plane explains the
+    images better; None: planes. ``wanted``: pixels that matter; None: all.
     """
     if "support" in maps:
         status[(status == Status.OK) & (maps["support"] < 1)] = Status.UNREFINED
