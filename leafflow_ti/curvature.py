@@ -30,7 +30,7 @@ SLOPES = ("slope_x", "slope_y")
 INPUTS = ("depth", *SLOPES, *(f"{name}_std" for name in SLOPES))
 """Maps that it follows from."""
 REACH = 2.5
-"""Farthest pixel along an axis, in σ of the refinement's window. A curvature is noisier by the square of what this is
+"""Farthest pixel along an axis, at most, in σ of the refinement's window. A curvature is noisier by the square of what this is
 smaller, and that of a leaf changes over larger distances."""
 ACROSS = 9
 """Pixels along a side of what is fitted, at most: their windows overlap much."""
@@ -51,7 +51,7 @@ class Around:
     @classmethod
     def of(cls, sigma: float, pitch: int) -> Around:
         """For a refinement whose window has ``sigma`` px."""
-        reach = max(1, round(REACH * sigma / pitch))
+        reach = max(1, int(REACH * sigma / pitch))
         half = min(reach, ACROSS // 2)
         return cls(tuple(round(reach * k / half) for k in range(-half, half + 1)), pitch)
 

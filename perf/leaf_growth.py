@@ -71,7 +71,7 @@ class Settings:
     )
     variants: tuple[Variant, ...] = (
         Variant("isotropic, 9 cameras", isotropic(0.1), "growth", (9, 1), window=49),
-        Variant("along its axis, 5x5 cameras", (1e-3, 0.0, 0.0), "strain", (5, 5), window=33),
+        Variant("along its axis, 5x5 cameras", (1e-3, 0.0, 0.0), "strain", (5, 5), window=49),
     )
     noises: tuple[float, ...] = (0.0, 1.0)
     seeds: int = 2

@@ -112,7 +112,7 @@ def test_coefficients_stay_where_kernels_can_index_them() -> None:
     )
     assert plan.refine is not None
     rows, cols = (
-        (n + 1) * plan.x.step + 1 + 2 * plan.refine.halo for n in (plan.band_rows, len(plan.x))
+        (n - 1 + 2 * plan.margin) * plan.x.step + 1 + 2 * plan.refine.halo for n in (plan.band_rows, len(plan.x))
     )  # fmt: skip
     assert plan.bands > 1
     assert len(plan.refine.frames) * len(plan.refine.cameras) * rows * cols < ADDRESSED

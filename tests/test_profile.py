@@ -166,8 +166,11 @@ def test_cases_are_what_their_settings_describe(name: str) -> None:
     covered = sum(rows.stop - rows.start for rows, _ in map(pipeline.extent, range(plan.bands)))
     # All of it is measured, and the rows around each band where the windows of those lie inside the images.
     reach, last = plan.reach("y"), made.height - 1
-    around = (plan.y[0] - stride >= reach) + (plan.y[-1] + stride <= last - reach)
-    assert covered == len(plan.y) + plan.margin * (around + 2 * (plan.bands - 1))
+    around = (
+        sum(reach <= first + sign * n * stride <= last - reach for n in range(1, plan.margin + 1))
+        for first, sign in ((plan.y[0], -1), (plan.y[-1], 1))
+    )
+    assert covered == len(plan.y) + sum(around) + 2 * plan.margin * (plan.bands - 1)
     assert np.ptp(made.read(0, 0, 0, 0, 9, 0, 9)) > 0
 
 
