@@ -30,8 +30,8 @@ SLOPES = ("slope_x", "slope_y")
 INPUTS = ("depth", *SLOPES, *(f"{name}_std" for name in SLOPES))
 """Maps that it follows from."""
 REACH = 2.5
-"""Farthest pixel along an axis, at most, in σ of the refinement's window. A curvature is noisier by the square of what this is
-smaller, and that of a leaf changes over larger distances."""
+"""Farthest pixel along an axis, at most, in σ of the refinement's window. A curvature is noisier by the square of what
+this is smaller, and that of a leaf changes over larger distances."""
 ACROSS = 9
 """Pixels along a side of what is fitted, at most: their windows overlap much."""
 INFLATION = 17.0
