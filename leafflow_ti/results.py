@@ -40,6 +40,8 @@ FORMAT = 1
 """Version of the layout, in the attribute ``leafflow_ti_format`` by which a store is recognised."""
 
 _COMPRESSOR = ZstdCodec(level=0, checksum=False)
+_UNFINISHED = "unfinished_maps"
+"""Attribute: maps that are being added."""
 _METADATA = "zarr.json"
 """The group's metadata file, attributes included (Zarr v3)."""
 
@@ -54,13 +56,15 @@ TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamp
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ResultStore:
-    """An open results store. ``frames``, ``y``, ``x``: coordinates of the axes t, y, x; ``names``: its maps."""
+    """An open results store. ``frames``, ``y``, ``x``: coordinates of the axes t, y, x; ``names``: its maps, but for
+    those that an interrupted ``leafflow-ti growth`` has left ``unfinished``."""
 
     path: Path
     frames: tuple[int, ...]
     y: NDArray[np.int64]
     x: NDArray[np.int64]
     names: tuple[str, ...]
+    unfinished: tuple[str, ...]
     unit_rows: int
     _group: zarr.Group
     _arrays: Mapping[str, zarr.Array[Any]]
@@ -138,8 +142,10 @@ class ResultStore:
             )
         arrays = dict(group.arrays())
         t, y, x = (np.asarray(arrays[axis][...], np.int64) for axis in ("t", "y", "x"))
-        names = tuple(n for n in with_std(QUANTITIES) if n in arrays)
-        return cls(path, tuple(t.tolist()), y, x, names, arrays["status"].chunks[1], group, arrays)
+        unfinished: Any = group.attrs.get(_UNFINISHED, [])
+        known = [n for n in with_std(QUANTITIES) if n in arrays]
+        names, left = (tuple(n for n in known if (n in unfinished) == out) for out in (False, True))
+        return cls(path, tuple(t.tolist()), y, x, names, left, arrays["status"].chunks[1], group, arrays)
 
     @property
     def attrs(self) -> dict[str, Any]:
@@ -148,13 +154,15 @@ class ResultStore:
         return found
 
     def update_attrs(self, attrs: Mapping[str, Any]) -> None:
-        """Set attributes; whoever reads meanwhile, or after a kill, finds the old ones or the new ones.
+        """Set attributes, None removes one; whoever reads meanwhile, or after a kill, finds the old ones or the new
+        ones.
 
         Raises RunError when the store cannot be written.
         """
         with _writing(self.path):
             metadata = json.loads((self.path / _METADATA).read_text(encoding="utf-8"))
-            metadata["attributes"].update(attrs)
+            found = metadata["attributes"] | dict(attrs)
+            metadata["attributes"] = {name: value for name, value in found.items() if value is not None}
             scratch = self.path / "status" / ".done" / f".{_METADATA}"
             scratch.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
             _flush(scratch)
@@ -276,7 +284,7 @@ class ResultStore:
         except ImportError:
             raise MissingExtra("xarray", "xarray", "ResultStore.to_xarray") from None
         dataset: xarray.Dataset = xarray.open_zarr(self.path, consolidated=False, chunks=None)
-        return dataset
+        return dataset.drop_vars(self.unfinished)
 
     def _repr_html_(self) -> str:
         """The middle one of the frames that are done, and how many are."""
@@ -293,19 +301,34 @@ class ResultStore:
         size = f"{len(self.frames)} x {self.y.size} x {self.x.size} (t, y, x)"
         return f"<ResultStore {self.path.name}, {size}, {len(self.done())} of {self.n_units} units done: {names}>"
 
-    def add_maps(self, names: Sequence[str], attrs: Mapping[str, Any]) -> ResultStore:
+    def add_maps(self, names: Sequence[str]) -> ResultStore:
         """The store with further maps, empty (those it has lose their values), to be filled by ``write_map``.
 
-        For what follows from the measured maps; ``attrs`` say how. Raises RunError when units are missing or the store
-        cannot be written.
+        For what follows from the measured maps. They are ``unfinished``, and nobody's to read, until ``finish_maps``.
+        Raises RunError when units are missing or the store cannot be written.
         """
         self._check_whole()
         array = self._arrays["status"]
+        self.update_attrs({_UNFINISHED: list(names)})
         with _writing(self.path):
             for name in names:
                 _create_map(self._group, name, f"{name}_std" in names, array.shape, array.chunks)
-        self.update_attrs(attrs)
         return ResultStore.open(self.path)
+
+    def finish_maps(self, attrs: Mapping[str, Any]) -> ResultStore:
+        """The store with the added maps among its ``names``; ``attrs`` say how they were made."""
+        self.update_attrs({**attrs, _UNFINISHED: None})
+        return ResultStore.open(self.path)
+
+    @property
+    def remark(self) -> str | None:
+        """What must be said of maps that are ``unfinished``; None where there are none."""
+        if not self.unfinished:
+            return None
+        return (
+            f"{self.path}: 'leafflow-ti growth' did not come to its end, so its maps ({self.unfinished[0]} and others) "
+            "are left out: run it again"
+        )
 
     def write_map(self, name: str, t_index: int, values: NDArray[Any]) -> None:
         """Write a map ``[y, x]`` of the frame with index ``t_index`` along t; RunError when that is impossible."""

@@ -31,7 +31,7 @@ from leafflow_ti.status import Status
 Array = NDArray[np.float64]
 
 ATTRIBUTE = "growth"
-"""Attribute of the store: the settings, and whether all frames have been written."""
+"""Attribute of the store: the settings."""
 INDEPENDENT = 0.1
 """Correlation of errors below which estimates count as independent."""
 VELOCITY = MOTION_NAMES[:3]
@@ -95,8 +95,7 @@ def measure_growth(
     noise = _correlation(store)
     gauge = _gauge(store, noise, strain_window)
     _check_average(average, len(store.frames))
-    settings: dict[str, Any] = {"strain_window_px": gauge.side, "average_frames": average, "complete": False}
-    store = store.add_maps(with_std(SURFACE_NAMES), {ATTRIBUTE: settings})
+    store = store.add_maps(with_std(SURFACE_NAMES))
     summary = _Summary()
     for t_index, (strain, rate, std) in enumerate(_averaged(store, gauge, noise, average)):
         maps = strain.maps()
@@ -105,7 +104,7 @@ def measure_growth(
         summary.add(maps, rate, std)
         if progress:
             progress(t_index + 1, len(store.frames))
-    store.update_attrs({ATTRIBUTE: settings | {"complete": True}})
+    store.finish_maps({ATTRIBUTE: {"strain_window_px": gauge.side, "average_frames": average}})
     found = summary.maps(), summary.agreement()
     return GrowthSummary(str(store.path), gauge.side, average, len(store.frames), store.interval_s, *found)
 

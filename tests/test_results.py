@@ -242,9 +242,15 @@ def test_maps_are_added_to_a_whole_store(full: ResultStore) -> None:
     before = files(full.path)
     values = np.random.default_rng(1).normal(size=(Y.size, X.size)).astype(np.float32)
     for _ in range(2):  # the second time replaces the first
-        store = full.add_maps(("area_rate", "area_rate_std"), {"growth": {"window": 5}})
-        assert np.isnan(store.read("area_rate")).all()
+        store = full.add_maps(("area_rate", "area_rate_std"))
+        assert store.names == NAMES
+        assert store.unfinished == ("area_rate", "area_rate_std")
+        assert store.remark is not None
+        assert "area_rate and others) are left out: run it again" in store.remark
         store.write_map("area_rate", 1, values)
+        store = store.finish_maps({"growth": {"window": 5}})
+        assert (store.unfinished, store.remark) == ((), None)
+        assert "unfinished_maps" not in store.attrs
     assert store.names == (*NAMES, "area_rate", "area_rate_std")
     assert store.attrs["growth"] == {"window": 5}
     np.testing.assert_array_equal(store.read("area_rate", 1), values)
@@ -258,7 +264,7 @@ def test_maps_are_added_to_a_whole_store(full: ResultStore) -> None:
 
 def test_maps_are_not_added_to_an_unfinished_store(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="6 of 6 units are not done"):
-        make(tmp_path / "out.zarr").add_maps(("area_rate",), {})
+        make(tmp_path / "out.zarr").add_maps(("area_rate",))
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,8 @@ def track(
     if way is not None:
         tracks = leaf_coordinates(store, tracks, way)
     tracks.save(out, overwrite)
-    typer.echo("\n".join([*format_tracks(tracks, store.interval_s), f"tracks: {out}"]))
+    notes = [] if store.remark is None else [f"note: {store.remark}"]
+    typer.echo("\n".join([*format_tracks(tracks, store.interval_s), *notes, f"tracks: {out}"]))
 
 
 def _axis(text: str) -> str | list[tuple[float, float]]:
@@ -178,7 +179,9 @@ def format_tracks(tracks: Tracks, interval_s: float | None) -> list[str]:
                 f"{np.quantile(drift, 0.95):.4f} px)"
             )
     label = tracks.variables.get("label")
-    groups = {"": np.ones(tracks.n_points, bool)} if label is None else {f"region {v}": label == v for v in set(label)}
+    groups = {"": np.ones(tracks.n_points, bool)}
+    if label is not None:
+        groups = {f"region {v}": label == v for v in np.unique(label)}
     for name, members in groups.items():
         lines += [f"{name:<12}{line}" for line in _growth(tracks.chosen(members), interval_s)]
     return lines
