@@ -76,7 +76,7 @@ def measure_regions(
             rows.append(row | region_row(field, area, place, names, noise, t, len(store.frames)))
     columns = _columns(rows, store)
     correlation = {MEANS[name]: tuple(noise.over_time(name).tolist()) for name in ("growth_rate", "area_rate")}
-    return RegionTable(_with_time(columns, store, clock), _notes(store, noise), correlation)
+    return RegionTable(_with_time(columns, store, clock), _notes(store, noise, columns), correlation)
 
 
 def _averaged_names(store: ResultStore) -> tuple[str, ...]:
@@ -156,20 +156,16 @@ def _with_time(
     return found | columns
 
 
-def _notes(store: ResultStore, noise: RegionNoise) -> tuple[str, ...]:
-    notes = []
-    if store.remark is not None:
-        notes.append(store.remark)
-    missing = store.n_units - len(store.done())
-    if missing:
-        notes.append(
-            f"{missing} of {store.n_units} units of {store.path} are not done: their pixels count as not valid"
-        )
+def _notes(store: ResultStore, noise: RegionNoise, columns: dict[str, NDArray[Any]]) -> tuple[str, ...]:
+    notes = [*store.remarks]
     if noise.gradient is None:
         notes.append(
             f"{store.path} does not state how errors hang together: standard errors count them as the same throughout "
             "a window, too long rather than too short"
         )
-    if store.interval_s is None:
+    for region in np.unique(columns["region"]):
+        if not (columns["valid_share"][columns["region"] == region] > 0).any():
+            notes.append(f"nothing of region {region} is measured in any frame: see the status map")
+    if store.interval_s is None and any("_per_frame" in name for name in columns):
         notes.append("the time between frames is unknown: rates are per frame (set interval_s in capture.toml)")
     return tuple(notes)

@@ -99,8 +99,7 @@ def measure_growth(
     summary = _Summary()
     for t_index, (strain, rate, std) in enumerate(_averaged(store, gauge, noise, average)):
         maps = strain.maps()
-        for name, values in maps.items():
-            store.write_map(name, t_index, values.astype(np.float32))
+        store.write_maps(t_index, {name: values.astype(np.float32) for name, values in maps.items()})
         summary.add(maps, rate, std)
         if progress:
             progress(t_index + 1, len(store.frames))
@@ -161,7 +160,8 @@ def _check_average(average: int, frames: int) -> None:
     if average < 1 or average % 2 == 0:
         raise UsageError(f"average {average}: choose an odd number of frames, each with as many before as behind")
     if average > 1 and average > frames:
-        raise UsageError(f"average {average}: the results hold {frames} frames: choose --average {frames} at most")
+        most = frames - (frames + 1) % 2
+        raise UsageError(f"average {average}: the results hold {frames} frames: choose --average {most} at most")
 
 
 def _averaged(

@@ -26,7 +26,10 @@ def appearing(path: Path) -> Iterator[Path]:
             shutil.rmtree(path)
         scratch.replace(path)
     except OSError as error:
-        raise RunError(f"{path}: cannot be written ({error.strerror or error}): mend that, or another name") from error
+        reason = error.strerror or str(error)
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            reason = f"{path.parent} is no folder"
+        raise RunError(f"{path}: cannot be written ({reason}): mend that, or give another name") from error
     finally:
         with contextlib.suppress(OSError):  # what went wrong above is what matters
             _remove(scratch)

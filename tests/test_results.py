@@ -245,11 +245,11 @@ def test_maps_are_added_to_a_whole_store(full: ResultStore) -> None:
         store = full.add_maps(("area_rate", "area_rate_std"))
         assert store.names == NAMES
         assert store.unfinished == ("area_rate", "area_rate_std")
-        assert store.remark is not None
-        assert "area_rate and others) are left out: run it again" in store.remark
-        store.write_map("area_rate", 1, values)
+        (remark,) = store.remarks
+        assert "area_rate and others) are left out: run it again" in remark
+        store.write_maps(1, {"area_rate": values})
         store = store.finish_maps({"growth": {"window": 5}})
-        assert (store.unfinished, store.remark) == ((), None)
+        assert (store.unfinished, store.remarks) == ((), ())
         assert "unfinished_maps" not in store.attrs
     assert store.names == (*NAMES, "area_rate", "area_rate_std")
     assert store.attrs["growth"] == {"window": 5}
@@ -259,7 +259,7 @@ def test_maps_are_added_to_a_whole_store(full: ResultStore) -> None:
         name: data for name, data in before.items() if name != "zarr.json"
     }
     with pytest.raises(ValueError, match="needs the shape"):
-        store.write_map("area_rate", 1, values[1:])
+        store.write_maps(1, {"area_rate": values[1:]})
 
 
 def test_maps_are_not_added_to_an_unfinished_store(tmp_path: Path) -> None:

@@ -38,10 +38,10 @@ def export(
     from leafflow_ti.results import ResultStore
 
     store = ResultStore.open(result)
-    if store.remark is not None:
-        typer.echo(f"note: {store.remark}")
     names = None if maps is None else [name.strip() for name in maps.split(",") if name.strip()]
     written = write(store, to, output, frames=frames, maps=names, overwrite=overwrite)
     size = sum(path.stat().st_size for path in written)
     files = "1 file" if len(written) == 1 else f"{len(written)} files"
+    for remark in store.remarks:
+        typer.echo(f"note: {remark}")
     typer.echo(f"{output}: {files}, {size / 2**20:.3g} MiB")

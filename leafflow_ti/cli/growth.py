@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from leafflow_ti.cli.progress import counted
+
 if TYPE_CHECKING:
     from leafflow_ti.surface_growth import GrowthSummary
 
@@ -40,7 +42,11 @@ def growth(
     """
     from leafflow_ti.surface_growth import measure_growth
 
-    summary = measure_growth(result, strain_window, average)
+    try:
+        summary = measure_growth(result, strain_window, average, counted("frame"))
+    except KeyboardInterrupt:
+        typer.echo("interrupted: maps that are not whole are left out until the same command has run again", err=True)
+        raise
     if as_json:
         typer.echo(json.dumps(summary.to_json(), indent=2, ensure_ascii=False))
     else:

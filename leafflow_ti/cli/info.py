@@ -219,7 +219,7 @@ def store_facts(store: ResultStore) -> dict[str, Any]:
         "interval_s": store.interval_s,
         "units_done": len(store.done()),
         "units": store.n_units,
-        "remark": store.remark,
+        "remarks": list(store.remarks),
         "maps_of_frame": store.frames[middle],
         "maps": maps,
         "status": counts,
@@ -236,7 +236,7 @@ def _store_lines(facts: dict[str, Any]) -> list[str]:
         f"maps         {facts['rows']} x {facts['columns']} (y, x), "
         f"pixels x {_range(facts['x_px'])}, y {_range(facts['y_px'])}",
         f"units        {done} of {units} done" + ("" if done == units else ": go on with run --resume"),
-        *([f"note         {facts['remark']}"] if facts["remark"] else []),
+        *(f"note         {remark}" for remark in facts["remarks"]),
         *_timing_lines(facts["attributes"].get("timings")),
         "",
         f"status of the pixels of {'all frames' if len(facts['frames']) > 1 else 'the frame'}",

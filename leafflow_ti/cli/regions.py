@@ -53,6 +53,9 @@ def regions(
     hours = None if light is None else parse_light(light)
     if hours is not None and diel_figure is None:
         raise UsageError("--light shades the night in a figure: give --diel-figure FILE.png, too")
+    wanted = [path for path in (output, diel, diel_figure) if path is not None]
+    if len({path.absolute() for path in wanted}) < len(wanted):
+        raise UsageError("the table, the diel curve and its figure are files of their own: give different names")
     for path in (output, diel):
         if path is not None:
             check_table_path(path, overwrite)

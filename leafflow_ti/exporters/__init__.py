@@ -59,6 +59,8 @@ FORMATS: dict[str, Format] = {
     "csv": Format((".csv",), "text:write_csv_file", "text:write_csv_folder", _one),
 }
 """Name -> format."""
+FILES = {".txt", ".vtk", ".vtu", ".zarr", ".parquet"}.union(*(kind.suffixes for kind in FORMATS.values()))
+"""Suffixes that no folder of an export has: whoever names one expects a file."""
 
 
 def export(
@@ -100,6 +102,10 @@ def _as_file(kind: Format, to: str, path: Path, selection: Selection) -> bool:
     if path.suffix.lower() not in kind.suffixes:
         if kind.folder is None:
             raise UsageError(f"{path}: {to} is one file: let its name end in {kind.suffixes[0]}")
+        if path.suffix.lower() in FILES:
+            raise UsageError(
+                f"{path}: no name for {to}: let that of a file end in {kind.suffixes[0]}, that of a folder in no suffix"
+            )
         return False
     if kind.file is None or kind.parts(selection) != 1:
         raise UsageError(
