@@ -105,7 +105,7 @@ class Adaptive:
                 joined = _joined(surfaces.shown[np.ix_(range(4), y, x)])
                 maps, codes = common.framed(index, maps, codes, joined)
                 if plan.refine:
-                    self._refine(tiles, surfaces, frame, maps, codes, chosen)
+                    self._refine(index, tiles, surfaces, frame, maps, codes, chosen)
                     self._drop_strays(maps, codes, surfaces, y, x)
                     common.settle(maps, codes)
                 codes[(codes == Status.OK) & edges[np.ix_(y, x)]] = Status.CONTESTED
@@ -269,26 +269,29 @@ class Adaptive:
         return maps, codes, chosen
 
     def _refine(
-        self, tiles: list[_Tile], surfaces: Surfaces, frame: int, maps: Maps, codes: Codes, chosen: NDArray[np.int64]
-    ) -> None:
+        self, index: int, tiles: list[_Tile], surfaces: Surfaces, frame: int, maps: Maps, codes: Codes,
+        chosen: NDArray[np.int64],
+    ) -> None:  # fmt: skip
         """Refine a band's pixels; those that no pass has values for from what the search found around them."""
+        curvature, needed = self.common.curvature(index, maps, codes), self.common.wanted(index)
         for tile in tiles:
-            status, taken = codes[tile.place], chosen[tile.place]
+            taken, status = chosen[tile.place], np.where(needed, codes, Status.NOT_COMPUTED)[tile.place]
+            bent = None if curvature is None else curvature[tile.place]
             wanted = surfaces.known[tile.pixels] & np.isin(status, BEYOND)
             for group in tile.groups(surfaces, taken):
                 mine = np.isin(taken, group) & (status == Status.OK)
                 begun = np.isin(surfaces.number[tile.pixels], group) & wanted
                 if mine.any() or begun.any():
-                    self._refine_group(tile, surfaces, group, frame, maps, codes, mine, begun)
+                    self._refine_group(tile, surfaces, group, frame, maps, codes, mine, begun, bent)
 
     def _refine_group(
         self, tile: _Tile, surfaces: Surfaces, group: list[int], frame: int, maps: Maps, codes: Codes, mine: Mask,
-        begun: Mask,
+        begun: Mask, curvature: NDArray[np.float64] | None,
     ) -> None:  # fmt: skip
         """Refine the pixels ``mine`` and ``begun`` of a tile with the images that a group of labels aims at, in place.
 
-        ``begun`` have no values yet: they keep none where the refinement does not converge. The model needs every
-        camera and frame to see a pixel; the refinement takes the images that do.
+        ``begun`` have no values yet: they keep none where the refinement does not converge. ``curvature``: as of
+        ``refine_maps``. The model needs every camera and frame to see a pixel; the refinement takes the images that do.
         """
         plan, aims = self.plan, [surfaces.aims[label] for label in group]
         stay = self._stay(tile, surfaces, group, frame)
@@ -304,7 +307,7 @@ class Adaptive:
                 for name in part.keys() & start.keys():
                     part[name][begun] = start[name][begun]
                 status[begun & ~refined_from(plan.refine, part, status)] = Status.NOT_COMPUTED
-            self.common.effort += refine_maps(stay.engine.refine, plan.refine, part, status, place, steps)
+            self.common.effort += refine_maps(stay.engine.refine, plan.refine, part, status, place, steps, curvature)
             found = mine if some is mine else begun & (status == Status.OK)
             codes[tile.place][found] = status[found]
             for name, values in part.items():

@@ -45,7 +45,8 @@ class Demand:
     """What decides the memory of a unit. ``cols``: output columns; ``n_cameras`` are read, ``n_maps`` written.
 
     ``tile_cols``: of a tile where the images are shifted tile by tile, 0 elsewhere; ``image``: rows and columns of an
-    image, where it is searched. ``waiting``: frames that the model takes later than the refinement.
+    image, where it is searched. ``margin``: output pixels that are computed around a unit. ``waiting``: frames that the
+    model takes later than the refinement.
     """
 
     config: RunConfig
@@ -56,6 +57,7 @@ class Demand:
     n_cameras: int
     n_maps: int
     cols: int
+    margin: int = 1
     tile_cols: int = 0
     image: tuple[int, int] = (0, 0)
     waiting: int = 0
@@ -107,9 +109,9 @@ class Demand:
         return total + (1 + ahead + self.waiting) * block + (2 + WRITE_BEHIND) * unit
 
     def _band(self, rows: int) -> Band:
-        """Two more rows and columns for the growth at the edges, and for the start of a refinement there."""
-        cols = self.tile_cols or self.cols + 2
-        return Band.of(self.problem.sampling, rows + 2, cols, int(self.config.window.stride))
+        """A unit with what is computed around it."""
+        cols = self.tile_cols or self.cols + 2 * self.margin
+        return Band.of(self.problem.sampling, rows + 2 * self.margin, cols, int(self.config.window.stride))
 
     def _refining(self, refine: Refinement, itemsize: int, gpu: bool) -> int:
         """Workspaces of the pixels that are refined at once."""

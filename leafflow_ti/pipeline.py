@@ -154,7 +154,10 @@ class Pipeline(Units):
                     if stay.engine.refine and plan.refine:
                         y, x = self.around(index)
                         place = Place(y, x, (stay.wide.y, stay.wide.x), plan.geometry)
-                        self.effort += refine_maps(stay.engine.refine, plan.refine, maps, codes, place)
+                        self.effort += refine_maps(
+                            stay.engine.refine, plan.refine, maps, codes, place,
+                            curvature=self.curvature(index, maps, codes), wanted=self.wanted(index),
+                        )  # fmt: skip
                         self.settle(maps, codes)
                     result = self.cut(index, maps, codes)
                 yield plan.unit(first + t - after - plan.frames[first], index), *result

@@ -21,6 +21,7 @@ from leafflow_ti.capture import (
     one_preshift_serves,
 )
 from leafflow_ti.config import RunConfig, resolve
+from leafflow_ti.curvature import SLOPES, Around
 from leafflow_ti.errors import ConfigError
 from leafflow_ti.field import CORRELATIONS, FLOW_GRADIENT_NAMES, MOTION_NAMES, PLANE_STRAIN_NAMES, QUANTITIES, with_std
 from leafflow_ti.identify import Limits
@@ -168,9 +169,18 @@ class Plan:
     def margin(self) -> int:
         """Output pixels around a band, and around the region, that are computed for the sake of those inside.
 
-        A pixel's growth is seen in its neighbours' velocities, and its refinement may start from theirs.
+        A pixel's growth is seen in its neighbours' velocities, and its refinement may start from theirs; the curvature
+        of the surface is seen in the slopes around either.
         """
-        return int(self.differences or self.refine is not None)
+        near = int(self.differences or self.refine is not None)
+        return near + self.around_curved.reach if self.around_curved else near
+
+    @property
+    def around_curved(self) -> Around | None:
+        """Where the refinement's curvature comes from; None: it takes planes, as the model measures no slopes."""
+        if self.refine is None or self.refine.flat or not set(SLOPES) <= set(self.measured):
+            return None
+        return Around.of(self.refine.sigma, self.x.step)
 
     def band(self, index: int) -> slice:
         """Output rows of one band."""
@@ -322,7 +332,9 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
         around=around,
     )  # fmt: skip
     depths = (0,) if isinstance(capture, ArrayCapture) else range(READ_AHEAD, -1, -1)
-    demand = Demand(config, problem, layout, ranges, refine, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x))
+    demand = Demand(
+        config, problem, layout, ranges, refine, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x), plan.margin
+    )
     demand = replace(demand, waiting=around[1] - problem.sampling.t.after)
     if adaptive:
         demand = replace(

@@ -85,6 +85,11 @@ class Refinement:
         return samples_across(self.size, self.thin)
 
     @property
+    def residuals(self) -> int:
+        """Samples of all images."""
+        return self.across**2 * len(self.frames) * len(self.cameras)
+
+    @property
     def reach(self) -> int:
         """Pixels that a sample may lie from its place in the preshifted window."""
         steps = max(max(abs(x), abs(y)) for x, y in self.cameras)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from leafflow_ti.kernels.refine_tables import DERIVATIVES, GROWTH, MAX_UNKNOWNS, SHIFTS, Out
+from leafflow_ti.kernels.refine_tables import DERIVATIVES, GROWTH, SHIFTS, START, Out
 from leafflow_ti.plan import Plan
 from leafflow_ti.refine_plan import Effort, Refinement
 from leafflow_ti.splines import filter_taps, spline_pieces
@@ -49,7 +49,7 @@ def count_refinement(plan: Plan, effort: Effort | None = None) -> dict[str, Work
     itemsize = 4 if plan.config.precision == "f32" else 8
     effort = effort or Effort.most(refine)
     pixels = plan.x.step**2
-    results = 8 * (Out.N + MAX_UNKNOWNS + 2)  # beside them the start
+    results = 8 * (Out.N + START)  # beside them the start
     return {
         "splines": Work(2 * 2 * len(filter_taps(refine.degree)), 2 * itemsize) * (len(refine.cameras) * pixels),
         "refine": Work(

@@ -1,7 +1,8 @@
 """Refined maps: starts from those of a model, refinement of single pixels, and what follows from its parameters.
 
 Where the refinement does not converge from a pixel's own start it is tried once more from the plane and the motion that
-a neighbour has arrived at. Pixels that it does not improve keep the values of the model.
+a neighbour has arrived at. Pixels that it does not improve keep the values of the model. A surface that the model has
+found curved is refined once more as curved, from the plane that has been found, unless the images contradict.
 """
 
 from __future__ import annotations
@@ -24,6 +25,10 @@ Array = NDArray[Any]
 Maps = dict[str, Array]
 PARAMETERS = ("depth", "slope_x", "slope_y", *MOTION_NAMES)
 """Maps that are parameters themselves, in their order; growth rates stand behind them."""
+PLANE_WINS = 4.0
+"""Sum of squared residuals, in their mean, by which a plane must explain the images better than a curved surface: two
+standard deviations, if all residuals were independent. A curvature is rarely larger than what one window can tell, but
+moves depth and strain all the same; that of a plane comes from systematic errors of the model, and is told at once."""
 _GROWTH = len(PARAMETERS)
 _NEIGHBOURS = ((0, -1), (0, 1), (-1, 0), (1, 0))
 
@@ -44,8 +49,9 @@ class Place:
 
 
 def refine_maps(
-    stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place, steps: int | None = None
-) -> Effort:
+    stage: RefineStage, plan: Refinement, maps: Maps, status: NDArray[np.uint8], place: Place, steps: int | None = None,
+    curvature: Array | None = None, wanted: NDArray[np.bool_] | None = None,
+) -> Effort:  # fmt: skip
     """Refine every pixel whose status is ok and whose depth is known, in place of ``maps`` [rows, cols] and ``status``;
     returns what it took.
 
@@ -54,25 +60,34 @@ def refine_maps(
     between surfaces (``support`` below 1): the refinement takes all of the window as one, and would mix them again.
     ``maps`` hold what the model gives; those that only the refinement gives are there, too, and not looked at. Of a
     ``flat`` patch it is the flow that must be known, not the depth. ``steps``: at most so many; None: as planned.
+    ``curvature`` [rows, cols, 3]: that of the surface, see ``surface_curvature``, taken unless a plane explains the
+    images better; None: planes. ``wanted``: pixels that matter; None: all.
     """
     if "support" in maps:
         status[(status == Status.OK) & (maps["support"] < 1)] = Status.UNREFINED
-    rows, cols = np.nonzero(refined_from(plan, maps, status))
+    begun = refined_from(plan, maps, status)
+    rows, cols = np.nonzero(begun if wanted is None else begun & wanted)
     if not rows.size:
         return Effort()
     start = _starts(plan, {name: maps[name][rows, cols] for name in starting(plan) if name in maps}, rows.size)
     found = _call(stage, place, rows, cols, start, steps)
     good, effort = found.converged, found.effort
-    parameters, covariance = found.parameters, found.covariance
+    parameters, covariance, cost = found.parameters, found.covariance, found.cost
     again, begin = _neighbours(plan, rows, cols, found, place, status.shape)
     if again.size:
         second = _call(stage, place, rows[again], cols[again], begin, steps)
         effort += second.effort
         better = again[second.converged]
-        parameters[better], covariance[better] = (
-            second.parameters[second.converged], second.covariance[second.converged]
-        )  # fmt: skip
+        for whole, part in ((parameters, second.parameters), (covariance, second.covariance), (cost, second.cost)):
+            whole[better] = part[second.converged]
         good[better] = True
+    if curvature is not None:
+        bent = np.flatnonzero(good & curvature[rows, cols].any(axis=-1))
+        if bent.size:
+            curved = _call(stage, place, rows[bent], cols[bent], parameters[bent], steps, curvature[rows, cols][bent])
+            effort += curved.effort
+            taken = curved.converged & (curved.cost <= (1 + PLANE_WINS / plan.residuals) * cost[bent])
+            parameters[bent[taken]], covariance[bent[taken]] = curved.parameters[taken], curved.covariance[taken]
     status[rows[~good], cols[~good]] = Status.UNREFINED
     rows, cols = rows[good], cols[good]
     lever = maps["disparity"][rows, cols].astype(float) * maps["depth"][rows, cols] if "disparity" in maps else None
@@ -140,12 +155,13 @@ def _starts(plan: Refinement, maps: Maps, n: int) -> Array:
 
 
 def _call(
-    stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array, steps: int | None = None
-) -> Refined:
+    stage: RefineStage, place: Place, rows: Array, cols: Array, start: Array, steps: int | None = None,
+    curvature: Array | None = None,
+) -> Refined:  # fmt: skip
     y, x = np.array(place.y)[rows] - place.corner[0], np.array(place.x)[cols] - place.corner[1]
     # A flat patch is the same anywhere in the image; from its own pixel its lengths stay small.
     at = np.zeros((len(y), 2)) if stage.plan.flat else place.rays(rows, cols)
-    return stage(y, x, at, start, steps)
+    return stage(y, x, at, start, steps, curvature)
 
 
 def _neighbours(

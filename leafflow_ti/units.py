@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.aim import Aim
 from leafflow_ti.capture import Capture
+from leafflow_ti.curvature import surface_curvature
 from leafflow_ti.engines import Engine, keep
 from leafflow_ti.field import CORRELATIONS, coarsened, empty_map
 from leafflow_ti.growth import growth_maps
@@ -87,7 +88,7 @@ class Units:
 
     def _around(self, rows: slice) -> slice:
         """Rows of the plan, and those that are computed around them."""
-        first, margin = int(self._y[0] != self.plan.y[0]), self.plan.margin
+        first, margin = self._y.index(self.plan.y[0]), self.plan.margin
         return slice(max(0, rows.start + first - margin), min(len(self._y), rows.stop + first + margin))
 
     def around(self, index: int) -> tuple[range, range]:
@@ -125,6 +126,22 @@ class Units:
             growth = growth_maps(framed, y, x, geometry.f_px, geometry.principal_px, sampling, joined)
             framed.update({name: values.astype(np.float32) for name, values in growth.items()})
         return framed, codes
+
+    def curvature(self, index: int, maps: Maps, codes: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+        """That of the surface, of a band and what is computed around it, for the refinement; None: it takes planes."""
+        around = self.plan.around_curved
+        if around is None:
+            return None
+        return surface_curvature(maps, codes, *self.around(index), self.plan.geometry, around)
+
+    def wanted(self, index: int) -> Mask:
+        """Pixels of a band and what is computed around it that are refined: its own, and their neighbours, from which
+        they may start."""
+        plan, (y, x) = self.plan, self.around(index)
+        rows, step = plan.y[plan.band(index)], plan.y.step
+        down = (np.array(y) >= rows[0] - step) & (np.array(y) <= rows[-1] + step)
+        across = (np.array(x) >= plan.x[0] - plan.x.step) & (np.array(x) <= plan.x[-1] + plan.x.step)
+        return np.asarray(down[:, None] & across)
 
     def settle(self, maps: Maps, codes: NDArray[np.uint8]) -> None:
         """What is identified once a refinement has changed values and standard errors."""

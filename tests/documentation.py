@@ -39,9 +39,11 @@ SHOWN_ONLY = {
 """Languages of blocks that are not tried out, with the reason."""
 
 _FENCE = re.compile(r"^```([^\n`]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
+_NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(%?)$", re.IGNORECASE)
 TOLERANCE = 0.02
 """Of shown numbers, relative: machines and seeds of compilers differ in the last digits of what is measured."""
+ERROR_TOLERANCE = 0.3
+"""Of the number behind ±, relative: a standard error is known that well."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def run_call(call: Call, place: str) -> None:
 
 
 def compare(shown: tuple[str, ...], output: str, place: str) -> None:
-    """Every shown line is one of the output, in the same order; numbers agree within ``TOLERANCE``, … is anything."""
+    """Every shown line is one of the output, in the same order (``agree``); … is anything."""
     rest = iter(output.splitlines())
     for line in shown:
         assert line.strip() == "…" or any(agree(line, real) for real in rest), (
@@ -144,24 +146,28 @@ def compare(shown: tuple[str, ...], output: str, place: str) -> None:
 
 
 def agree(shown: str, real: str) -> bool:
-    """Whether a line of output is the one shown: numbers agree within ``TOLERANCE``, … is any words."""
-    return _agree(shown.split(), real.split())
+    """Whether a line of output is the one shown: numbers agree within the tolerances, … is any words."""
+    return _agree(shown.split(), real.split(), TOLERANCE)
 
 
-def _agree(shown: list[str], real: list[str]) -> bool:
+def _agree(shown: list[str], real: list[str], tolerance: float) -> bool:
     if not shown:
         return not real
     if shown[0] == "…":
-        return any(_agree(shown[1:], real[n:]) for n in range(len(real) + 1))
-    return bool(real) and _same(shown[0], real[0]) and _agree(shown[1:], real[1:])
+        return any(_agree(shown[1:], real[n:], TOLERANCE) for n in range(len(real) + 1))
+    if not real or not _same(shown[0], real[0], tolerance):
+        return False
+    return _agree(shown[1:], real[1:], ERROR_TOLERANCE if shown[0] == "±" else TOLERANCE)
 
 
-def _same(shown: str, real: str) -> bool:
+def _same(shown: str, real: str, tolerance: float) -> bool:
     if shown == real:
         return True
-    if not (_NUMBER.match(shown) and _NUMBER.match(real)):
+    numbers = _NUMBER.match(shown), _NUMBER.match(real)
+    if not (numbers[0] and numbers[1] and numbers[0][2] == numbers[1][2]):
         return False
-    return abs(float(shown) - float(real)) <= TOLERANCE * abs(float(shown))
+    expected, found = (float(number[1]) for number in numbers)
+    return abs(expected - found) <= tolerance * abs(expected)
 
 
 def check_toml(text: str, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import tomllib
 from collections.abc import Iterator
@@ -21,7 +22,9 @@ from leafflow_ti.config import RunConfig
 
 pytestmark = pytest.mark.xdist_group("docs")
 
-CONTINUES = {"opening.md": "growth.md", "formats.md": "getting-started.md"}
+CONTINUES = {"opening.md": "growth.md"} | dict.fromkeys(
+    ("formats.md", "models.md", "performance.md", "rig.md"), "getting-started.md"
+)
 """Pages that go on with the files of another one."""
 
 
@@ -42,9 +45,14 @@ def test_what_a_page_shows_runs(page: Path, session: Session) -> None:
     session.try_out(page)
 
 
-def test_what_the_readme_shows_runs(tmp_path: Path) -> None:
-    invoke(["simulate", "cube", str(tmp_path / "own"), "--size", "240x120"])  # "your own images"
-    Session(tmp_path / "own").try_out(README)
+OWN_IMAGES = "simulate leaf own --size 240x160 --cameras 5 --frames 6 --interval-s 120 --supersampling 2"
+"""What README's "your own images" and ``labels.tif`` are."""
+
+
+def test_what_the_readme_shows_runs(session: Session) -> None:
+    with contextlib.chdir(session.folder):
+        invoke(OWN_IMAGES.split())
+    Session(session.folder / "own").try_out(README)
 
 
 # --- nothing is forgotten, nothing invented --------------------------------------------------------------------------
@@ -112,6 +120,14 @@ def test_every_page_is_in_the_contents() -> None:
     assert sorted(listed) == sorted(page.stem for page in PAGES if page.stem != "index"), index
 
 
+def test_links_of_the_readme_lead_somewhere() -> None:
+    """Those of the site's pages are checked while it is built."""
+    links = re.findall(r"\]\(([^)#]+)(?:#[\w-]+)?\)", README.read_text(encoding="utf-8"))
+    local = [link for link in links if not link.startswith("https:")]
+    assert len(local) > 10
+    assert [link for link in local if not (ROOT / link).is_file()] == []
+
+
 def test_public_names_have_documentation() -> None:
     assert all(getattr(leafflow_ti, name).__doc__ for name in leafflow_ti.__all__)
 
@@ -123,6 +139,11 @@ def test_shown_output_is_compared() -> None:
     assert agree("depth mm … 9.85", "depth mm 971 9.86")
     assert not agree("depth mm … 9.85", "depth mm 971 9.2")
     assert not agree("done", "done in 3 s")
+    assert agree("97% ok", "98% ok")
+    assert not agree("97% ok", "98 ok")
+    assert agree("1.00 ± 0.10 mm", "1.01 ± 0.12 mm")
+    assert not agree("1.00 ± 0.10 mm", "1.10 ± 0.12 mm")
+    assert not agree("1.00 ± 0.10 mm", "1.00 ± 0.20 mm")
     assert agree("done in … s", "done in 3 s")
 
 

@@ -37,7 +37,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("synthetic", "metrics"), 3),
     **dict.fromkeys(("runtime", "ceilings"), 4),
     **dict.fromkeys(("stages",), 5),
-    **dict.fromkeys(("growth", "refinement", "identify", "principal", "deformation"), 5),
+    **dict.fromkeys(("growth", "refinement", "identify", "principal", "deformation", "curvature"), 5),
     **dict.fromkeys(("search", "bands", "model_plan", "plan", "reading", "engines", "pipeline", "results", "work"), 6),
     **dict.fromkeys(("stays", "units", "surfaces", "adaptive"), 6),
     **dict.fromkeys(("refinement", "refine_work"), 6),

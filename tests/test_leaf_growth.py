@@ -67,8 +67,8 @@ def test_growth_along_one_axis() -> None:
     """.2 %/frame of lengths along the leaf, none across; images are rounded to 8 bits, without further noise."""
     scene = LeafScene(n_cols=3, n_rows=3, baseline_mm=(1.2, 1.2), size=(261, 221), growth=(2e-3, 0.0, 0.0), **LEAF)
     found = report(scene, preshift=(-13, -13), deformation="strain")
-    # A window of 31 px sees the leaf bend, which a plane patch takes for some .007 %/frame of shrinking.
-    assert abs(found.errors["growth_rate_percent"].mean) < 0.015
+    # A window of 31 px sees the leaf bend, which a plane patch would take for some .007 %/frame of shrinking.
+    assert abs(found.errors["growth_rate_percent"].mean) < 0.004
     for name in ("growth_rate", "strain_rate_11", "strain_rate_22", "strain_rate_12", "principal_rate_1"):
         assert found.errors[f"{name}_percent"].std < 0.03, name
         assert 0.5 < found.coverage[name].std < 1.6, name

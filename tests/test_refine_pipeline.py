@@ -131,12 +131,12 @@ def begin_elsewhere(monkeypatch: pytest.MonkeyPatch, wrong: Any) -> list[int]:
     """
     usual, calls = refinement._call, []
 
-    def call(stage: Any, place: Any, rows: Any, cols: Any, start: Any, steps: int | None) -> Any:
+    def call(stage: Any, place: Any, rows: Any, cols: Any, start: Any, *others: Any) -> Any:
         if not calls:
             start = start.copy()
             start[wrong(rows, cols), 0] *= 3.0
         calls.append(len(rows))
-        return usual(stage, place, rows, cols, start, steps)
+        return usual(stage, place, rows, cols, start, *others)
 
     monkeypatch.setattr(refinement, "_call", call)
     return calls

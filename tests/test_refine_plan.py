@@ -82,8 +82,10 @@ def test_unknowns_and_maps(options: dict[str, Any], motion: int, modes: int) -> 
     assert {"disparity", *planned.refine.names} <= set(names)
     assert ("rotation_z" in names, "acceleration_z" in names) == (motion >= 6, motion == 9)
     assert ("growth_rate" in names, "strain_rate_12" in names) == (modes > 0, modes == 3)
+    # Where the surface's curvature comes from, and a neighbour of those that are refined for their own sake.
+    assert planned.margin == 1 + (planned.around_curved.reach if planned.around_curved else 0)
+    assert (planned.around_curved is None) == (planned.model == "affine-translation")
     # Pixels that keep the model's values keep its growth.
-    assert planned.margin == 1
     assert planned.differences == ("growth_rate" in planned.measured and modes > 0)
 
 

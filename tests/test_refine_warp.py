@@ -17,9 +17,9 @@ SCENE_OF_MANY = replace(SCENE, n_rows=2, n_cols=3, n_frames=5)
 
 
 def warps_of(device: Device, case: Case, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Homographies [K, 8] in pixels and moves [K, 8 functions, n] of all images at a state [15] as kernels have it."""
+    """Warps [K, Warp.GAIN] in pixels and moves [K, 8 functions, n] of all images at a state [15] as kernels have it."""
     from leafflow_ti.kernels.engine import lane_kernel, ti
-    from leafflow_ti.kernels.refine_tables import SHIFTS, Image, Scalar, Size
+    from leafflow_ti.kernels.refine_tables import SHIFTS, Image, Scalar, Size, Warp
     from leafflow_ti.kernels.refine_warp import Slot, warp_functions
 
     spec = device.dense
@@ -60,7 +60,7 @@ def warps_of(device: Device, case: Case, state: np.ndarray) -> tuple[np.ndarray,
         return np.array(rows[size[name] : size[name] + n * groups]).reshape(n, groups * lanes)[:, :images].T
 
     n = int(size[Size.UNKNOWNS])
-    return region(Size.HOMOGRAPHY, 8), region(Size.MOVES, SHIFTS * n).reshape(-1, SHIFTS, n)
+    return region(Size.HOMOGRAPHY, Warp.GAIN), region(Size.MOVES, SHIFTS * n).reshape(-1, SHIFTS, n)
 
 
 def moved(moves: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -112,3 +112,24 @@ def test_every_unknown_moves_the_warps_as_rays_do(
                 left_out = np.linalg.norm(state[9:12]) * t**4 * np.linalg.norm(state[6:9]) / 12 * SCENE.f_px / state[0]
             limit = 1e-6 + 2e-6 * np.abs(wanted[..., i]).max() + left_out
             np.testing.assert_allclose(found[..., i], wanted[..., i], atol=limit, err_msg=f"{i} in {k}")
+
+
+@pytest.mark.parametrize("modes", [0, 3])
+def test_a_curved_surface_is_seen_as_rays_see_it(device: Callable[[str], Device], modes: int) -> None:
+    """To rounding: by half a pixel beside its tangent plane at the edge of the window."""
+    from leafflow_ti.kernels.refine_tables import Warp
+
+    case, state, curvature = Case(SCENE_OF_MANY, modes=modes), general_state((0.0, 0.0, 0.0)), (3e-4, -1e-4, 2e-4)
+    views, offsets = Views.of(case.scene, X, Y), window(33, 8)
+    x, y = offsets.T
+    bent = 0.5 * (curvature[0] * x * x + curvature[2] * y * y) + curvature[1] * x * y
+    warps, _ = warps_of(device("f64"), case, state)
+    farthest = 0.0
+    for k in range(len(views.times)):
+        h, (bx, by, bz) = warps[k], warps[k, Warp.BEND : Warp.BEND + 3]
+        depth = offsets @ h[6:8] + 1 + bz * bent
+        seen = np.stack([offsets @ h[0:2] + h[2] + bx * bent, offsets @ h[3:5] + h[5] + by * bent], 1) / depth[:, None]
+        wanted = warp(views, state, offsets, k, curvature)
+        np.testing.assert_allclose(seen, wanted - np.array([X, Y]) + case.scene.principal - case.shifts[k], atol=1e-8)
+        farthest = max(farthest, np.abs(wanted - warp(views, state, offsets, k)).max())
+    assert farthest > 0.3

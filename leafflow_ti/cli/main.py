@@ -21,7 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "demo:demo",
         "Simulate a rotating cube, measure it, compare with the truth, write a report: no input needed.",
     ),
-    "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube)."),
+    "simulate": ("simulate:app", "Write a synthetic capture with its exact truth (plane, cube, leaf, leaves)."),
     "run": ("run:run", "Measure depth, normals and 3D motion of a capture."),
     "growth": ("growth:growth", "Measure growth and strain from the motion in a results store."),
     "evaluate": ("evaluate:evaluate", "Compare results with a known truth."),

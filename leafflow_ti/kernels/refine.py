@@ -69,7 +69,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
                 warps.hand_over(slot, i, size, p, r)
             if p[scalars(slot, size) + Scalar.RESAMPLE] > 0.5:
                 for i in range(size[Size.SAMPLE_GROUPS]):
-                    samples.warp(slot, i, at, size, value, origin, sample, coef, S, r)
+                    samples.warp(slot, i, at, size, value, origin, sample, coef, S, r, p)
             for i in range(size[Size.SAMPLE_GROUPS]):
                 samples.texture(slot, i, size, value, sample, S, r, p)
             solver.masses(slot, size, r, p)
@@ -114,7 +114,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
                 warps.hand_over(slot, i, size, p, r)
             elif ti.static(stage == Stage.WARP):
                 if p[scalars(slot, size) + Scalar.RESAMPLE] > 0.5:
-                    samples.warp(slot, i, centre[pixel], size, value, origin, sample, coef, S, r)
+                    samples.warp(slot, i, centre[pixel], size, value, origin, sample, coef, S, r, p)
             elif ti.static(stage == Stage.TEXTURE):
                 samples.texture(slot, i, size, value, sample, S, r, p)
             elif ti.static(stage == Stage.MASSES):
@@ -140,7 +140,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
         coef_in: ti.types.ndarray(dtype=real, ndim=1),  # [planes * rows * pitch]
         mask_in: ti.types.ndarray(dtype=real, ndim=1),  # [rows * pitch]
         centre_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [pixels]: element of a plane
-        start_in: ti.types.ndarray(dtype=precise, ndim=1),  # [pixels * (2 + MAX_UNKNOWNS)]: x0, y0, parameters
+        start_in: ti.types.ndarray(dtype=precise, ndim=1),  # [pixels * START]: x0, y0, parameters, curvature
         sample_ws: ti.types.ndarray(dtype=reals, ndim=1),  # [slots * SLOT_REAL]
         sample_number_ws: ti.types.ndarray(dtype=real, ndim=1),
         image_ws: ti.types.ndarray(dtype=precises, ndim=1),  # [slots * SLOT_PRECISE]

@@ -90,6 +90,15 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
         return (r[at + 3 * along] * x + r[at + 3 * along + 1] * y + r[at + 3 * along + 2]) * depth
 
     @ti.func
+    def place(
+        at: ti.i32, x: ti.template(), y: ti.template(), curved: ti.template(), along: ti.i32, r: ti.template()
+    ):  # fmt: skip
+        """The same of the points of a curved surface, ``curved`` of its κ."""
+        depth = 1.0 / (r[at + 6] * x + r[at + 7] * y + 1.0 + r[at + Warp.BEND + 2] * curved)
+        flat = r[at + 3 * along] * x + r[at + 3 * along + 1] * y + r[at + 3 * along + 2]
+        return (flat + r[at + Warp.BEND + along] * curved) * depth
+
+    @ti.func
     def spline(m: ti.i32, u: ti.template(), value: ti.template()):
         """Weight of neighbour m for a point ``u`` behind the middle one; then of its derivatives, in turn."""
         at = Value.SPLINE + m * taps
@@ -103,6 +112,7 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
     def warp(
         slot: ti.template(), group: ti.i32, centre: ti.i32, size: ti.template(), value: ti.template(),
         origin: ti.template(), sample: ti.template(), coef: ti.template(), S: ti.template(), r: ti.template(),
+        p: ti.template(),
     ):  # fmt: skip
         """Value and derivatives, to the second, of every image at one vector of samples."""
         groups, pitch = size[Size.SAMPLE_GROUPS], size[Size.PITCH]
@@ -110,9 +120,12 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
         # One place for all vectors of samples, unless they are warped at once.
         weights = slot.real + size[Size.SPLINES] + group * ti.static(6 * taps if spec.gpu else 0)
         x, y = sample[group], sample[groups + group]
+        bent = scalars(slot, size) + Scalar.CURVATURE
+        xx, xy, yy = ti.cast(0.5 * p[bent], real), ti.cast(p[bent + 1], real), ti.cast(0.5 * p[bent + 2], real)
+        curved = x * (x * xx + y * xy) + y * y * yy
         for k in range(size[Size.IMAGES]):
             at = (slot.real + size[Size.WARP]) * lanes + k * Warp.N
-            ix, iy = position(at, x, y, 0, r), position(at, x, y, 1, r)
+            ix, iy = place(at, x, y, curved, 0, r), place(at, x, y, curved, 1, r)
             inside = ti.select(ti.max(ti.max(ix, 0.0 - ix), ti.max(iy, 0.0 - iy)) < V(farthest), V(1.0), V(0.0))
             ix = ti.max(ti.min(ix, V(farthest)), V(0.0 - farthest))
             iy = ti.max(ti.min(iy, V(farthest)), V(0.0 - farthest))
@@ -161,7 +174,8 @@ def sample_functions(spec: KernelSpec, taps: int) -> SimpleNamespace:
     ):  # fmt: skip
         """One vector of samples: values of all images where the warps are now, and the texture.
 
-        Since the images were sampled the warps have moved little: the second-order expansion there is exact enough.
+        Since the images were sampled the warps have moved little, and what a curvature adds to them hardly at all:
+        the second-order expansion there is exact enough.
         Where they have just been sampled, the texture's derivatives and the functions of the window are made, too.
         """
         groups, terms = size[Size.SAMPLE_GROUPS], size[Size.TERMS]

@@ -11,6 +11,7 @@ from leafflow_ti.kernels.refine_tables import (
     MAX_UNKNOWNS,
     SHIFTS,
     SHOWN,
+    START,
     TERMS,
     Code,
     Image,
@@ -66,11 +67,13 @@ def solve_functions(spec: KernelSpec) -> SimpleNamespace:
     ):  # fmt: skip
         """The start of a pixel: position and parameters; all images trusted, no change of brightness."""
         s, groups = scalars(slot, size), size[Size.IMAGE_GROUPS]
-        at = pixel * (MAX_UNKNOWNS + 2)
+        at = pixel * START
         p[s + Scalar.X0], p[s + Scalar.Y0] = start[at], start[at + 1]
         for i in range(MAX_UNKNOWNS):
             p[s + Scalar.Q + i] = start[at + 2 + i]
             p[s + Scalar.ACCEPTED + i] = start[at + 2 + i]
+        for i in range(3):
+            p[s + Scalar.CURVATURE + i] = start[at + 2 + MAX_UNKNOWNS + i]
         for i in range(Scalar.COST, Scalar.ROBUST + 1):
             p[s + i] = precise(0.0)
         p[s + Scalar.RESAMPLE], p[s + Scalar.DRIFT], p[s + Scalar.SAMPLINGS] = precise(1.0), precise(0.0), precise(0.0)

@@ -17,6 +17,8 @@ DERIVATIVES = 6
 """Of a sample: value, x, y, xx, xy, yy."""
 MAX_UNKNOWNS = 15
 """Z0, ZX, ZY, N, Ω, A, and up to three growth rates."""
+START = MAX_UNKNOWNS + 5
+"""Numbers that a pixel starts from: x0, y0, its parameters, its curvature."""
 GROWTH = 12
 """Where the growth rates stand among the unknowns, all of which are kept, estimated or not."""
 
@@ -74,10 +76,11 @@ class Warp(IntEnum):
     H = 0  # [8]: homography from the window to the image, both about their centres; its last entry is 1
     D = 8  # [4]: ∂x/∂δ at the centre, row by row
     BLUR = 12  # [3]: weights of the texture's second derivatives xx, xy, yy
-    GAIN = 15  # [TERMS]
-    TRUST = 21
-    SAMPLED = 22  # [8]: homography with which the image was sampled
-    N = 32
+    BEND = 15  # [3]: what the curvature of the surface adds, to x, y and the divisor
+    GAIN = 18  # [TERMS]
+    TRUST = 24
+    SAMPLED = 25  # [8]: homography with which the image was sampled
+    N = 33
 
 
 class Geometry(IntEnum):
@@ -158,6 +161,7 @@ class Scalar(IntEnum):
     RESAMPLE = 1347  # whether the images are sampled in this pass
     DRIFT = 1348  # px that the warps have moved since
     SAMPLINGS = 1349  # passes in which they were
+    CURVATURE = 1350  # [3]: K, xx, xy, yy
     N = 1360
 
 

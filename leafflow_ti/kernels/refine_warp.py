@@ -10,6 +10,10 @@ of a turn would be taken for velocity. With ``ρ = 1 / Z(δ)``, which is linear 
 
 so every image is seen through a homography ``H = [R G L - γ η^T | γ]`` of (δ, 1), exactly.
 
+A surface that is curved has ``Z0 ρ = 1 - η δ - κ(δ)``, κ = ½ δ^T K δ, with a K that is known beforehand. It is seen at
+``H (δ, 1) + β κ(δ)``, ``β = R G r0 - γ``, exactly, too. What a change of the parameters does is taken from the
+plane: that makes steps a little shorter or longer than they should be, and leaves alone where they end.
+
 A change dH moves what an image shows at its pixel as if the window point had moved by ``dδ``, ``(dδ, 0) = ξ (δ, 1) -
 λ (δ, 1)`` with ``ξ = H^-1 dH``: a quadratic polynomial of eight coefficients. Texture T and its gradient then give the
 change of the grey value as a sum over eight functions of the window, the same ones for every image:
@@ -153,6 +157,20 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
                     P[to + (6 + c) * step] = P[to + (6 + c) * step] - moved
 
     @ti.func
+    def behind(
+        r: ti.template(), g: ti.i32, t: ti.template(), s: ti.i32, size: ti.template(), P: ti.template(),
+        p: ti.template(),
+    ):  # fmt: skip
+        """Component r of β = R G r0 - γ: where a point goes that lies farther along the viewing ray than the plane. Of
+        an anisotropic growth the mean acts on what is not in the surface."""
+        size_now = 1.0 + t * p[s + Scalar.Q + GROWTH]
+        if size[Size.MODES] > 1:
+            size_now = 1.0 + t * (0.5 * (p[s + Scalar.Q + GROWTH] + p[s + Scalar.Q + GROWTH + 1]))
+        h = g + Geometry.R + 3 * r
+        turned = P[h] * p[s + Scalar.RAY] + P[h + 1] * p[s + Scalar.RAY + 1] + P[h + 2]
+        return turned * size_now - P[g + Geometry.GAMMA + r]
+
+    @ti.func
     def moves(
         slot: ti.template(), group: ti.i32, t: ti.template(), size: ti.template(), value: ti.template(),
         P: ti.template(), p: ti.template(),
@@ -173,15 +191,9 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
                 c2 = (P[g + Geometry.GAMMA + 2] - 1.0) * (0.0 - near)
                 rank_one(to, step, g, c0, c1, c2, ex, ey, one, P)
             elif unknown < 3:
-                # R G r0 - γ; of an anisotropic growth the mean acts on what is not in the surface.
-                size_now = 1.0 + t * p[s + Scalar.Q + GROWTH]
-                if size[Size.MODES] > 1:
-                    size_now = 1.0 + t * (0.5 * (p[s + Scalar.Q + GROWTH] + p[s + Scalar.Q + GROWTH + 1]))
-                r0, r1 = p[s + Scalar.RAY], p[s + Scalar.RAY + 1]
-                h = g + Geometry.R
-                c0 = (P[h] * r0 + P[h + 1] * r1 + P[h + 2]) * size_now - P[g + Geometry.GAMMA]
-                c1 = (P[h + 3] * r0 + P[h + 4] * r1 + P[h + 5]) * size_now - P[g + Geometry.GAMMA + 1]
-                c2 = (P[h + 6] * r0 + P[h + 7] * r1 + P[h + 8]) * size_now - P[g + Geometry.GAMMA + 2]
+                c0, c1, c2 = (
+                    behind(0, g, t, s, size, P, p), behind(1, g, t, s, size, P, p), behind(2, g, t, s, size, P, p)
+                )  # fmt: skip
                 eta = s + Scalar.ETA + 2 * unknown
                 rank_one(to, step, g, c0, c1, c2, p[eta], p[eta + 1], precise(0.0), P)
             elif unknown < 6:
@@ -281,9 +293,9 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
         slot: ti.template(), group: ti.i32, size: ti.template(), value: ti.template(), image: ti.template(),
         P: ti.template(), p: ti.template(),
     ):  # fmt: skip
-        """The homography in pixels about the window's and the block's centre, ∂x/∂δ there, and the blur's weights."""
-        s, h = scalars(slot, size), geometry(slot, group, size) + Geometry.H
-        groups = size[Size.IMAGE_GROUPS]
+        """The homography in pixels about the window's and the block's centre, ∂x/∂δ there, the blur's weights, β."""
+        s, g = scalars(slot, size), geometry(slot, group, size)
+        h, groups = g + Geometry.H, size[Size.IMAGE_GROUPS]
         to = slot.precise + size[Size.HOMOGRAPHY] + group
         depth = 1.0 / P[h + 8]
         for r in range(2):
@@ -305,6 +317,12 @@ def warp_functions(spec: KernelSpec) -> SimpleNamespace:
         P[b] = (yy * yy + xy * xy) * weight - value[Value.SMOOTHING]
         P[b + groups] = (xx * xy + yx * yy) * weight * (0.0 - 2.0)
         P[b + 2 * groups] = (xx * xx + yx * yx) * weight - value[Value.SMOOTHING]
+        t, bend = image[Image.TIME * groups + group], to + Warp.BEND * groups
+        b2 = behind(2, g, t, s, size, P, p)
+        for r in ti.static(range(2)):
+            centre = image[(Image.SHIFT_X + r) * groups + group] + p[s + Scalar.X0 + r]
+            P[bend + r * groups] = (behind(r, g, t, s, size, P, p) * value[Value.FOCAL] - centre * b2) * depth
+        P[bend + 2 * groups] = b2 * depth
 
     @ti.func
     def hand_over(slot: ti.template(), k: ti.i32, size: ti.template(), p: ti.template(), r: ti.template()):

@@ -168,12 +168,14 @@ class RefineStage:
             self._mask = self.device.array(plane)
 
     def __call__(
-        self, y: NDArray[np.int64], x: NDArray[np.int64], rays: Array, start: Array, steps: int | None = None
-    ) -> Refined:
+        self, y: NDArray[np.int64], x: NDArray[np.int64], rays: Array, start: Array, steps: int | None = None,
+        curvature: Array | None = None,
+    ) -> Refined:  # fmt: skip
         """Refine the pixels in rows ``y`` and columns ``x`` of the block [n].
 
         ``rays`` [n, 2]: their positions from the principal point, px; ``start`` [n, 15]: parameters. ``steps``: at most
-        so many; None: as planned.
+        so many; None: as planned. ``curvature`` [n, 3]: that of the surface, K (xx, xy, yy) in 1/px², see
+        ``kernels.refine_warp``; None: planes.
         All frames of the window have been pushed.
         """
         from leafflow_ti.kernels.refine_tables import Out, Size
@@ -184,6 +186,7 @@ class RefineStage:
             cameras = len(self.plan.cameras)
             origin = ((frames[:, None] * cameras + np.arange(cameras)) * self._plane).ravel()
             size, most = self.size.copy(), steps or self.plan.steps
+            bent = np.zeros((n, 3)) if curvature is None else curvature
             size[Size.STEPS] = most
             size[Size.MASKED] = int(self._mask is not None)
             out = device.zeros(n * Out.N, "algebra")
@@ -191,7 +194,7 @@ class RefineStage:
             arguments = (
                 device_size, *self._tables[1:], device.array(origin, "int"), self._samples, self._coefficients,
                 self._mask if self._mask is not None else device.zeros(1), device.array(y * self.pitch + x, "int"),
-                device.array(np.concatenate([rays, start], axis=1), "algebra"), *self._workspaces(), out,
+                device.array(np.concatenate([rays, start, bent], axis=1), "algebra"), *self._workspaces(), out,
             )  # fmt: skip
             for first in range(0, n, self._batch):
                 self._launch(first, min(self._batch, n - first), most, arguments)

@@ -102,9 +102,9 @@ class Workspaces:
 def bytes_per_pixel() -> int:
     """Of one output pixel on the host: start, position, results as they are written and as they are handed on (two
     copies of all covariances), and the maps that are derived from them."""
-    from leafflow_ti.kernels.refine_tables import MAX_UNKNOWNS, Out
+    from leafflow_ti.kernels.refine_tables import START, Out
 
-    return 8 * (2 * (MAX_UNKNOWNS + 2) + 2 * Out.N + DERIVED)
+    return 8 * (2 * START + 2 * Out.N + DERIVED)
 
 
 def _sizes(plan: Refinement, lanes: int, gpu: bool) -> tuple[NDArray[np.int32], int, int]:

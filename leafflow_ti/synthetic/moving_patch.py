@@ -5,6 +5,7 @@ An oracle: rays, planes and rotations, no flow equation and no expansion. With o
 and rays ``r = ((x0 + δx)/f, (y0 + δy)/f, 1)``,
 
     Z(δ) = (Z0 - ZX Cx - ZY Cy) / (1 - ZX rx - ZY ry)          C = Z0 (x0/f, y0/f, 1)
+    Z0 / Z(δ) is less by ½ δ^T K δ where the patch is curved
     X(δ, t) = C + N t + V(Ω t) A t²/2 + R(Ω t) (1 + t E) (Z(δ) r - C)
     x_k = f (X - s_k) / X_z                                     camera k at s_k, frame t
 
@@ -82,15 +83,20 @@ def directions(motion: int, modes: int, flat: bool = False) -> Array:
     return np.concatenate([every[:, rigid], growth], axis=1)
 
 
-def warp(views: Views, state: Array, offsets: Array, k: int) -> Array:
+def warp(
+    views: Views, state: Array, offsets: Array, k: int, curvature: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Array:
     """Where image ``k`` shows the points seen at ``offsets`` [S, 2] of the reference: [S, 2] px from the principal
-    point."""
+    point. ``curvature``: K (xx, xy, yy), 1/px²."""
     depth, zx, zy = state[:3]
     velocity, omega, acceleration, strain = state[3:6], state[6:9], state[9:12], state[12:15]
     pixels = np.array([views.x0, views.y0]) + offsets
     rays = np.column_stack([pixels / views.f_px, np.ones(len(offsets))])
     centre = depth * np.array([views.x0 / views.f_px, views.y0 / views.f_px, 1.0])
     z = (depth - zx * centre[0] - zy * centre[1]) / (1.0 - zx * rays[:, 0] - zy * rays[:, 1])
+    xx, xy, yy = curvature
+    bent = 0.5 * (xx * offsets[:, 0] ** 2 + yy * offsets[:, 1] ** 2) + xy * offsets[:, 0] * offsets[:, 1]
+    z = 1.0 / (1.0 / z - bent / depth)
     t = float(views.times[k])
     grown = (z[:, None] * rays - centre) @ (np.eye(3) + t * in_plane(zx, zy, strain))
     points = (
