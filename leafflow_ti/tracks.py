@@ -238,8 +238,9 @@ def check_path(path: str | Path, overwrite: bool = False) -> Path:
     if suffix == ".nc":
         try:
             import h5netcdf  # noqa: F401
-        except ImportError:
-            raise MissingExtra("h5netcdf", "netcdf", "writing NetCDF") from None
+            import h5py  # noqa: F401
+        except ImportError as error:
+            raise MissingExtra(str(error.name).partition(".")[0], "netcdf", "writing NetCDF") from None
     return path
 
 

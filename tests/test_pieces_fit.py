@@ -191,6 +191,8 @@ def test_what_cannot_be_done_leaves_nothing(
         ("pyarrow", ("track", "-o", "t.parquet"), "parquet"),
         ("h5netcdf", ("track", "-o", "t.nc"), "netcdf"),
         ("h5netcdf", ("export", "--to", "netcdf", "-o", "t.nc"), "netcdf"),
+        ("h5py", ("track", "-o", "t.nc"), "netcdf"),
+        ("h5py", ("export", "--to", "netcdf", "-o", "t.nc"), "netcdf"),
         ("matplotlib", ("report", "-o", "t.html"), "plot"),
     ],
 )

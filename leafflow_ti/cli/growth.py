@@ -58,9 +58,9 @@ def format_growth(summary: GrowthSummary) -> list[str]:
     from leafflow_ti.field import quantity
     from leafflow_ti.rates import per_hour
 
-    over = f", means over {summary.average} frames" if summary.average > 1 else ""
+    over = f"s, means over {summary.average} frames" if summary.average > 1 else "s" * (summary.frames > 1)
     lines = [
-        f"{summary.path}: strain in windows of {summary.window_px} px, {summary.frames} frames{over}",
+        f"{summary.path}: strain in windows of {summary.window_px} px, {summary.frames} frame{over}",
         f"  {'median over pixels and frames':<30}{'value':>11}{'std error':>11}  {'unit':<10}{'pixels':>7}",
     ]
     for name, found in summary.maps.items():
