@@ -36,6 +36,8 @@ from leafflow_ti.stages.refine_tables import noise_correlation as interpolated_n
 
 Array = NDArray[np.float64]
 
+INDEPENDENT = 0.1
+"""Correlation of errors below which estimates count as independent."""
 KEY = "noise_correlation"
 """Of the attribute ``plan`` of a results store."""
 DIGITS = 5
@@ -78,6 +80,10 @@ class NoiseCorrelation:
         """Correlation matrix [n, n] of errors at these output columns "x", rows "y" or frames "t"; a number n: at as
         many that follow each other."""
         return correlation_matrix(getattr(self, axis), places)
+
+    def independent(self, axis: str) -> int:
+        """Distance from which on estimates are independent: output columns "x" or rows "y"."""
+        return int(np.flatnonzero(getattr(self, axis) >= INDEPENDENT).max()) + 1
 
 
 def correlation_matrix(r: Array, places: ArrayLike) -> Array:

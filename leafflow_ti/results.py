@@ -44,7 +44,7 @@ COORDINATES: dict[str, dict[str, Any]] = {
     "x": {"long_name": "column in the reference image, to the right", "units": "px"},
 }
 
-TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
+TIME: dict[str, Any] = {"long_name": "time of the results", "units": "s"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

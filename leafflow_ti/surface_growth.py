@@ -32,8 +32,6 @@ Array = NDArray[np.float64]
 
 ATTRIBUTE = "growth"
 """Attribute of the store: the settings."""
-INDEPENDENT = 0.1
-"""Correlation of errors below which estimates count as independent."""
 VELOCITY = MOTION_NAMES[:3]
 _NEEDED = ("depth", *with_std(VELOCITY), *CORRELATIONS)
 _WANTED = ("slope_x", "slope_y", "growth_rate", "growth_rate_std")
@@ -128,8 +126,7 @@ def _correlation(store: ResultStore) -> NoiseCorrelation:
 
 def default_window(noise: NoiseCorrelation, pitch: int) -> int:
     """Side [px] of the window that holds three by three estimates whose errors are independent."""
-    far = max(int(np.flatnonzero(r >= INDEPENDENT).max()) + 1 for r in (noise.x, noise.y))
-    return 2 * far * pitch + 1
+    return 2 * max(noise.independent("x"), noise.independent("y")) * pitch + 1
 
 
 def _gauge(store: ResultStore, noise: NoiseCorrelation, window: int | None) -> Gauge:
