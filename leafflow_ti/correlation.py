@@ -11,6 +11,9 @@ correlation of interpolated noise: neighbours whose samples fall between one ano
 Along t a velocity is a difference between late and early frames, which the next frame's result takes with shifted
 weights: ``R(d) = Σ v(t) v(t + d) / Σ v²`` again, v the derivative filters under the window, or the weights of a
 regression's slope. Some of these are negative: what is averaged over a few frames is better than its single values say.
+
+What a window tells of derivatives, slopes and growth among them, weighs the noise with opposite signs on both sides:
+``v(Δ) Δ`` in place of v. Such errors are correlated negatively from about half a window on.
 """
 
 from __future__ import annotations
@@ -33,6 +36,8 @@ from leafflow_ti.stages.refine_tables import noise_correlation as interpolated_n
 
 Array = NDArray[np.float64]
 
+INDEPENDENT = 0.1
+"""Correlation of errors below which estimates count as independent."""
 KEY = "noise_correlation"
 """Of the attribute ``plan`` of a results store."""
 DIGITS = 5
@@ -47,6 +52,7 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 class NoiseCorrelation:
     """Correlation of the velocity's errors at 0, 1, 2, ... output columns, rows and frames; beyond the end it is 0.
 
+    ``x_gradient``, ``y_gradient``: of what a window tells of derivatives along x and y; None where it is not known.
     ``stated``: by the run itself. Else the store is an older one, and errors are taken as the same throughout a window:
     that is safe for means, but never for differences.
     """
@@ -54,6 +60,8 @@ class NoiseCorrelation:
     x: Array
     y: Array
     t: Array
+    x_gradient: Array | None = None
+    y_gradient: Array | None = None
     stated: bool = True
 
     @classmethod
@@ -64,20 +72,27 @@ class NoiseCorrelation:
             side = int(tomllib.loads(store.attrs["config"])["window"]["size"])
             x, y = (_at_pitch(np.ones(side), _pitch(positions)) for positions in (store.x, store.y))
             return cls(x, y, np.ones(USUAL_FRAMES), stated=False)
-        found = {axis: np.asarray(values, np.float64) for axis, values in plan[KEY].items()}
-        return cls(
-            _at_pitch(found["x"], _pitch(store.x)), _at_pitch(found["y"], _pitch(store.y)), found.get("t", np.ones(1))
-        )
+        pitch = {"x": _pitch(store.x), "y": _pitch(store.y)}
+        found = {name: _at_pitch(np.array(r, np.float64), pitch.get(name[0], 1)) for name, r in plan[KEY].items()}
+        return cls(**{"t": np.ones(1)} | found)
 
     def between(self, axis: str, places: ArrayLike) -> Array:
         """Correlation matrix [n, n] of errors at these output columns "x", rows "y" or frames "t"; a number n: at as
         many that follow each other."""
-        at = np.arange(places) if isinstance(places, int) else np.asarray(places, int)
-        distance = np.abs(np.subtract.outer(at, at))
-        stated = getattr(self, axis)
-        first = np.zeros(max(int(distance.max(initial=0)) + 1, stated.size))
-        first[: stated.size] = stated
-        return np.asarray(first[distance])
+        return correlation_matrix(getattr(self, axis), places)
+
+    def independent(self, axis: str) -> int:
+        """Distance from which on estimates are independent: output columns "x" or rows "y"."""
+        return int(np.flatnonzero(getattr(self, axis) >= INDEPENDENT).max()) + 1
+
+
+def correlation_matrix(r: Array, places: ArrayLike) -> Array:
+    """Matrix [n, n] of the correlation ``r`` at distances 0, 1, 2, ..., 0 beyond; ``places`` as for ``between``."""
+    at = np.arange(places) if isinstance(places, int) else np.asarray(places, int)
+    distance = np.abs(np.subtract.outer(at, at))
+    first = np.zeros(max(int(distance.max(initial=0)) + 1, r.size))
+    first[: r.size] = r
+    return np.asarray(first[distance])
 
 
 def _pitch(positions: NDArray[np.int64]) -> int:

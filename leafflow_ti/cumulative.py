@@ -40,8 +40,6 @@ Floats = NDArray[np.float64]
 RATES = {"growth_rate": "growth", "area_rate": "area_growth"}
 """Map of a rate -> name of what it adds up to."""
 STRAINS = ("strain_11", "strain_22", "strain_12", "strain_1", "strain_2", "strain_angle")
-INDEPENDENT = 0.1
-"""Correlation of errors below which estimates count as independent."""
 LEAST_POINTS, LEAST_SPREAD = 4, 0.02
 """Points of a fit, and the smaller of their principal moments as a part of the larger: less is a line."""
 
@@ -66,8 +64,7 @@ def track_growth(store: ResultStore, tracks: Tracks, gauge: float | None = None)
 
 def usual_gauge(store: ResultStore, tracks: Tracks) -> float:
     """Diameter [px] that holds three estimates across whose errors are nearly independent, and six points."""
-    noise, lattice = NoiseCorrelation.of(store).x, Lattice.of(store.x, store.y)
-    independent = int(np.argmax(noise < INDEPENDENT)) if (noise < INDEPENDENT).any() else noise.size
+    independent, lattice = NoiseCorrelation.of(store).independent("x"), Lattice.of(store.x, store.y)
     x, y = (at[tracks.start_index][tracks.known[tracks.start_index]] for at in (tracks.x, tracks.y))
     area = float(np.ptp(x) * np.ptp(y)) if x.size > 1 else 0.0
     return float(max(2 * independent * lattice.step[0], 6 * np.sqrt(area / max(x.size, 1)), 2))
@@ -114,6 +111,9 @@ def strain_since(tracks: Tracks, gauge: float) -> dict[str, Floats]:
             found["place_growth"][k] = 100 * (np.sqrt(determinant) - 1)
         for name, values in zip(STRAINS, _components(50 * (squared - np.eye(2))), strict=True):
             found[name][k] = values
+    for name in ("place_growth", *STRAINS):  # nothing has happened yet: what is left is rounding
+        nothing = np.nan if name == "strain_angle" else 0.0
+        found[name][at] = np.where(np.isfinite(found[name][at]), nothing, np.nan)
     return found | {"tangents": axes}
 
 

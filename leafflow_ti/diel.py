@@ -14,18 +14,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
+from leafflow_ti.errors import InputError, MissingExtra, UsageError
+from leafflow_ti.number_text import duration
 from leafflow_ti.region_table import RegionTable, over_frames
 from leafflow_ti.tables import write_table
+from leafflow_ti.whole import appearing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
 DAY_H = 24.0
 GROWTH = ("growth", "area_rate")
 """Quantities that can be folded, the preferred one first: growth of the run, and that of the motion in a window."""
+UNDATED: dict[str, dict[str, None]] = {
+    ".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None},
+}  # fmt: skip
+"""Suffix of a figure -> what is left out of it, so that the same curves give the same file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +63,11 @@ class DielCurves:
         bins = np.unique(self.columns["hour_start"]).size
         days = int(self.columns["days"].max(initial=0))
         what = "time of day" if self.clock else "time since frame 0 (no start time is known)"
-        span = f"{self.covered_h:.3g} h" + (
-            ", less than a day: no hour is seen twice" if self.covered_h < DAY_H else ""
+        short = " (less than a day: every hour is seen once at most)" if self.covered_h < DAY_H else ""
+        return (
+            f"growth by {what}: {bins} bin{'s' * (bins != 1)} from {duration(3600 * self.covered_h)}{short}, "
+            f"at most {days} day{'s' * (days != 1)} in a bin"
         )
-        return f"growth by {what}: {bins} bins with values from {span}, up to {days} day{'s' * (days != 1)} in a bin"
 
 
 def fold(table: RegionTable, bin_h: float = 1.0, quantity: str | None = None) -> DielCurves:
@@ -148,29 +156,42 @@ def parse_light(text: str) -> tuple[float, float]:
     return on, off
 
 
+def check_figure_path(path: str | Path, overwrite: bool = False) -> Path:
+    """The path of a figure that can be drawn.
+
+    Raises UsageError for another suffix than those of ``UNDATED``, or where ``path`` exists and may not be replaced;
+    MissingExtra where matplotlib is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in UNDATED:
+        raise UsageError(f"{path}: the figure's format is not clear: let the name end in one of {', '.join(UNDATED)}")
+    if path.is_dir() or (path.exists() and not overwrite):
+        raise UsageError(f"{path} exists: {'' if path.is_dir() else 'give --overwrite to replace it, or '}another name")
+    _figure_class()
+    return path
+
+
+def _figure_class() -> type[Figure]:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtra("matplotlib", "plot", "a diel figure") from None
+    return Figure
+
+
 def write_diel_figure(
     curves: DielCurves, path: str | Path, light: tuple[float, float] | None = None, overwrite: bool = False
 ) -> Path:
     """Draw the curves with their bands, and the night shaded where the hours of ``light`` are given.
 
-    Raises UsageError where ``path`` exists, MissingExtra where matplotlib is not installed, RunError when it cannot be
-    written.
+    The file appears when it is whole. Raises like ``check_figure_path``, and RunError when it cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtra("matplotlib", "plot", "a diel figure") from None
-    path = Path(path)
-    if path.exists() and not overwrite:
-        raise UsageError(f"{path} exists: give --overwrite to replace it, or another name")
-    figure = Figure(figsize=(7.2, 4.0), layout="constrained")
+    path = check_figure_path(path, overwrite)
+    figure = _figure_class()(figsize=(7.2, 4.0), layout="constrained")
     axes = figure.add_subplot()
     _draw(axes, curves, light)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=150, facecolor="white", metadata={"Software": None} if path.suffix == ".png" else None)
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path}: the figure cannot be written ({error}): give a name that ends in .png") from error
+    with appearing(path) as scratch:
+        figure.savefig(scratch, dpi=150, facecolor="white", metadata=UNDATED[path.suffix.lower()])
     return path
 
 
@@ -196,8 +217,8 @@ def _draw(axes: Axes, curves: DielCurves, light: tuple[float, float] | None) -> 
     axes.set_xlabel("time of day [h]" if curves.clock else "time since frame 0, modulo a day [h]")
     axes.set_ylabel("growth of the area [%/h]")
     days = int(curves.columns["days"].max(initial=0))
-    title = f"{days} day{'s' * (days != 1)}; dark band: standard error"
-    axes.set_title(title + (", light band: between days" if days > 1 else ""), fontsize=9)
+    bands = "dark band: standard error, light band: between days" if days > 1 else "band: standard error"
+    axes.set_title(f"{days} day{'s' * (days != 1)}; {bands}", fontsize=9)
     if curves.columns["region"].size:
         axes.legend(fontsize=8, frameon=False)
 

@@ -38,6 +38,8 @@ TRUTH_MAPS: dict[str, int | None] = {
 
 LABELS = ("face", "region")
 """Keys of ``truth.npz`` with integer labels per pixel."""
+INTERIOR = ", interior"
+"""How the names of regions without their borders end."""
 
 SCALARS = {
     "depth": "depth",
@@ -210,7 +212,7 @@ def label_regions(truth: Maps, margin: int) -> dict[str, Mask]:
                 mask = np.asarray(truth[key] == label)
                 regions[f"{key} {label}"] = mask
                 if margin > 0:
-                    regions[f"{key} {label}, interior"] = erode(mask, margin)
+                    regions[f"{key} {label}{INTERIOR}"] = erode(mask, margin)
     return regions
 
 

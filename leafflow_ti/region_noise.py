@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.correlation import KEY, NoiseCorrelation
+from leafflow_ti.correlation import NoiseCorrelation, correlation_matrix
 from leafflow_ti.results import ResultStore
 
 Floats = NDArray[np.float64]
@@ -58,11 +58,10 @@ class RegionNoise:
     def of(cls, store: ResultStore) -> RegionNoise:
         """Of a store; where it states no correlations, errors count as the same throughout a window."""
         noise, attrs = NoiseCorrelation.of(store), store.attrs
-        stated: Mapping[str, list[float]] = attrs.get("plan", {}).get(KEY, {})
-        step_y, step_x = (int(p[1] - p[0]) if p.size > 1 else 1 for p in (store.y, store.x))
         gradient = None
-        if "x_gradient" in stated:
-            gradient = np.array(stated["y_gradient"])[::step_y], np.array(stated["x_gradient"])[::step_x]
+        if noise.y_gradient is not None and noise.x_gradient is not None:
+            gradient = noise.y_gradient, noise.x_gradient
+        step_y, step_x = (int(p[1] - p[0]) if p.size > 1 else 1 for p in (store.y, store.x))
         growth = attrs.get("growth", {})
         half = int(growth.get("strain_window_px", 1)) // 2
         reach, averaged = (half // step_y, half // step_x), int(growth.get("average_frames", 1))
@@ -77,7 +76,7 @@ class RegionNoise:
         """Variance of ``area_rate`` in the frame with index ``t`` of ``frames``, per that of a single frame's."""
         half = self.averaged // 2
         n = min(frames, t + half + 1) - max(0, t - half)
-        return float(_matrix(self.frames, n).sum()) / n**2
+        return float(correlation_matrix(self.frames, n).sum()) / n**2
 
     def over_time(self, name: str) -> Floats:
         """Correlation of the errors of the map ``name`` at 0, 1, 2, ... frames."""
@@ -117,15 +116,8 @@ def mean_variance(weights: Floats, std: Floats, terms: tuple[Term, ...]) -> floa
 
 def correlated(one: Floats, two: Floats, r_y: Floats, r_x: Floats) -> float:
     """``Σ_ij one_i two_j R_y(Δy) R_x(Δx)`` over maps [y, x]."""
-    y, x = (_matrix(r, n) for r, n in zip((r_y, r_x), one.shape, strict=True))
+    y, x = (correlation_matrix(r, n) for r, n in zip((r_y, r_x), one.shape, strict=True))
     return float(np.sum(one * (y @ two @ x)))
-
-
-def _matrix(r: Floats, n: int) -> Floats:
-    """Correlation matrix [n, n] of ``r`` at distances 0, 1, 2, ..."""
-    padded = np.zeros(n)
-    padded[: min(n, r.size)] = r[:n]
-    return np.asarray(padded[np.abs(np.subtract.outer(np.arange(n), np.arange(n)))])
 
 
 def _near(part: Maps) -> float:

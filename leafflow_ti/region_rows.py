@@ -9,21 +9,35 @@ or, without a depth, alike; pixels less certain than most count less (``certain`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.errors import InputError
-from leafflow_ti.field import Field
+from leafflow_ti.field import CORRELATIONS, MOTION_NAMES, Field, with_std
 from leafflow_ti.labels import Coverage
 from leafflow_ti.mesh import slope_normals, viewing_rays
 from leafflow_ti.region_divergence import differenced, divergence_variance, fitted
 from leafflow_ti.region_noise import RegionNoise, mean_variance
+from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 
 Floats = NDArray[np.float64]
+
+
+_ALWAYS = (*with_std(("depth", "slope_x", "slope_y", *MOTION_NAMES[:3])), *CORRELATIONS)
+"""Maps that areas, and the standard errors of mean growth, follow from."""
+
+
+def measured(store: ResultStore, t: int, names: Sequence[str]) -> Field:
+    """The maps ``names`` of the frame with index ``t``, as far as the store has them, with their standard errors and
+    what ``region_row`` needs beside them; NaN but for pixels with the status ok."""
+    status = store.read("status", t)
+    wanted = [name for name in dict.fromkeys((*with_std(names), *_ALWAYS)) if name in store.names]
+    maps = {name: np.where(status == Status.OK, store.read(name, t), np.float32(np.nan)) for name in wanted}
+    return Field(maps, status, store.y, store.x, store.frames[t], store.attrs)
 
 
 def surface_area(field: Field) -> Floats:

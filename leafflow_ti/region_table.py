@@ -59,20 +59,26 @@ class RegionTable:
         return to_pandas(self.columns)
 
     @property
-    def growth(self) -> tuple[str, str] | None:
-        """The growth that the table has, ``growth`` or ``area_rate``, and its rate: ``per_h`` where it is known."""
-        found = [(name, rate) for name in ("growth", "area_rate") for rate in ("per_h", "per_frame")]
-        return next((pair for pair in found if f"{pair[0]}_percent_{pair[1]}" in self.columns), None)
+    def growths(self) -> tuple[tuple[str, str], ...]:
+        """The measures of growth that the table has, ``growth`` (of the run) and ``area_rate`` (from the motion), each
+        with its rate: ``per_h`` where that is known, else ``per_frame``."""
+        found: dict[str, str] = {}
+        for name in ("growth", "area_rate"):
+            for rate in ("per_frame", "per_h"):
+                if f"{name}_percent_{rate}" in self.columns:
+                    found[name] = rate
+        return tuple(found.items())
 
     def summary(self) -> list[str]:
         """A line per region: pixels, valid share and area of its last frame, mean growth over the frames."""
-        title = "" if self.growth is None else f"{self.growth[0].replace('_', ' ')} [{_unit(self.growth[1])}]"
-        lines = [f"{'region':>7}{'frames':>8}{'pixels':>9}{'valid':>8}{'area [mm²]':>13}{title:>22}"]
-        lines += [
-            f"{region:>7}{frames:>8}{pixels:>9}{valid:>8}{area:>13}{growth:>22}"
-            for region, frames, pixels, valid, area, growth in self._rows()
-        ]
-        return [line.rstrip() for line in lines]
+        widths = (7, 8, 9, 8, 13, *(22 for _ in self.growths))
+        rows = (self._titles(), *self._rows())
+        return ["".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
+
+    def _titles(self) -> tuple[str, ...]:
+        """The heads of the summary's columns."""
+        growths = (f"{name.replace('_', ' ')} [%/{rate.removeprefix('per_')}]" for name, rate in self.growths)
+        return ("region", "frames", "pixels", "valid", "area [mm²]", *growths)
 
     def _rows(self) -> Iterator[tuple[str, ...]]:
         """The cells of each region in the summary."""
@@ -80,14 +86,13 @@ class RegionTable:
             rows = self.of(region)
             seen = rows["pixels"] > 0
             area = _last(rows["area_mm2"], seen) if "area_mm2" in rows else np.nan
-            text = ""
-            if self.growth is not None:
-                name, rate = self.growth
+            growths = []
+            for name, rate in self.growths:
                 values, errors = rows[f"{name}_percent_{rate}"], rows[f"{name}_se_percent_{rate}"]
                 mean, error = over_frames(values, errors, self.correlation.get(name, (1.0,)))
-                text = f"{mean:.4g} ± {error:.2g}" if np.isfinite(mean) else "-"
+                growths.append(f"{mean:.4g} ± {error:.2g}" if np.isfinite(mean) else "-")
             numbers = (f"{_last(rows['pixels'], seen):.0f}", f"{_last(rows['valid_share'], seen):.0%}", f"{area:.5g}")
-            yield (str(region), str(int(seen.sum())), *("-" if "nan" in one else one for one in numbers), text)
+            yield (str(region), str(int(seen.sum())), *("-" if "nan" in one else one for one in numbers), *growths)
 
     def __repr__(self) -> str:
         frames = np.unique(self.columns["frame"])
@@ -95,14 +100,9 @@ class RegionTable:
         return "\n".join([head, *self.summary()])
 
     def _repr_html_(self) -> str:
-        growth = [] if self.growth is None else [f"{self.growth[0].replace('_', ' ')} [{_unit(self.growth[1])}]"]
-        head = "".join(f"<th>{name}</th>" for name in ("region", "frames", "pixels", "valid", "area [mm²]", *growth))
+        head = "".join(f"<th>{name}</th>" for name in self._titles())
         rows = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in self._rows())
         return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
-
-
-def _unit(rate: str) -> str:
-    return f"%/{rate.removeprefix('per_')}"
 
 
 def over_frames(values: Floats, errors: Floats, correlation: tuple[float, ...]) -> tuple[float, float]:

@@ -21,15 +21,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from leafflow_ti.errors import InputError, UsageError
-from leafflow_ti.field import CORRELATIONS, Field, quantity
+from leafflow_ti.field import quantity
 from leafflow_ti.following import Followed
 from leafflow_ti.labels import Coverage, Labels, covered
 from leafflow_ti.rates import per_hour
 from leafflow_ti.region_noise import RegionNoise
-from leafflow_ti.region_rows import region_row, surface_area
+from leafflow_ti.region_rows import measured, region_row, surface_area
 from leafflow_ti.region_table import RegionTable
 from leafflow_ti.results import ResultStore
-from leafflow_ti.status import Status
 from leafflow_ti.tables import column_name
 
 __all__ = ["MEANS", "RegionTable", "measure_regions"]
@@ -45,7 +44,6 @@ MEANS: dict[str, str] = {
 """Map -> name of its columns: what is averaged over a region, as far as the store has it."""
 _OF_CAMERAS = ("flow_x", "flow_y")
 """Maps that matter for a single camera alone, where there is no velocity."""
-_SHAPE = ("depth", "slope_x", "slope_y")
 
 
 def measure_regions(
@@ -71,14 +69,14 @@ def measure_regions(
     noise = RegionNoise.of(store)
     rows: list[dict[str, float]] = []
     for t, regions in enumerate(_places(store, given, still)):
-        field = _measured(store, t, names)
+        field = measured(store, t, names)
         area = surface_area(field) if "depth" in field else np.ones(field.shape)
         for region, (place, about) in regions.items():
             row = {"region": float(region), "frame": float(field.frame), **about}
             rows.append(row | region_row(field, area, place, names, noise, t, len(store.frames)))
     columns = _columns(rows, store)
     correlation = {MEANS[name]: tuple(noise.over_time(name).tolist()) for name in ("growth_rate", "area_rate")}
-    return RegionTable(_with_time(columns, store, clock), _notes(store, noise), correlation)
+    return RegionTable(_with_time(columns, store, clock), _notes(store, noise, columns), correlation)
 
 
 def _averaged_names(store: ResultStore) -> tuple[str, ...]:
@@ -109,17 +107,6 @@ def _places(
     for t in range(len(store.frames)):
         seen = followed.coverage(t)
         yield {value: (seen.get(value), {"followed_share": followed.share(value, t)}) for value in labels.values}
-
-
-def _measured(store: ResultStore, t: int, names: tuple[str, ...]) -> Field:
-    """The maps that are needed of a frame, with their standard errors; NaN but for pixels with the status ok."""
-    status = store.read("status", t)
-    ok = status == Status.OK
-    bases = dict.fromkeys((*names, *_SHAPE))
-    wanted = [n for base in bases for n in (base, f"{base}_std") if n in store.names]
-    wanted += [name for name in CORRELATIONS if name in store.names]
-    maps = {name: np.where(ok, store.read(name, t), np.float32(np.nan)) for name in wanted}
-    return Field(maps, status, store.y, store.x, store.frames[t], store.attrs)
 
 
 def _columns(rows: list[dict[str, float]], store: ResultStore) -> dict[str, NDArray[Any]]:
@@ -169,18 +156,16 @@ def _with_time(
     return found | columns
 
 
-def _notes(store: ResultStore, noise: RegionNoise) -> tuple[str, ...]:
-    notes = []
-    missing = store.n_units - len(store.done())
-    if missing:
-        notes.append(
-            f"{missing} of {store.n_units} units of {store.path} are not done: their pixels count as not valid"
-        )
+def _notes(store: ResultStore, noise: RegionNoise, columns: dict[str, NDArray[Any]]) -> tuple[str, ...]:
+    notes = [*store.remarks]
     if noise.gradient is None:
         notes.append(
             f"{store.path} does not state how errors hang together: standard errors count them as the same throughout "
             "a window, too long rather than too short"
         )
-    if store.interval_s is None:
+    for region in np.unique(columns["region"]):
+        if not (columns["valid_share"][columns["region"] == region] > 0).any():
+            notes.append(f"nothing of region {region} is measured in any frame: see the status map")
+    if store.interval_s is None and any("_per_frame" in name for name in columns):
         notes.append("the time between frames is unknown: rates are per frame (set interval_s in capture.toml)")
     return tuple(notes)

@@ -8,12 +8,10 @@ list the folders of groups, where a foreign entry would be reported, but never t
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -21,11 +19,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import zarr
-from numcodecs import Zstd
 from numpy.typing import ArrayLike, NDArray
-from zarr.codecs import ZstdCodec
 from zarr.errors import NodeNotFoundError
 
+from leafflow_ti.chunk_files import COMPRESSOR, flush, write_chunks, writing
 from leafflow_ti.display import results_html
 from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
 from leafflow_ti.field import QUANTITIES, Field, empty_map, map_attributes, quantity, with_std
@@ -33,13 +30,11 @@ from leafflow_ti.field import QUANTITIES, Field, empty_map, map_attributes, quan
 if TYPE_CHECKING:
     import xarray
 
-WRITERS = 16
-"""Chunks of a unit that are written together: the disk forces them out at once, and while kernels run, which hold the
-interpreter, each of the threads gets on a step between two of them."""
 FORMAT = 1
 """Version of the layout, in the attribute ``leafflow_ti_format`` by which a store is recognised."""
 
-_COMPRESSOR = ZstdCodec(level=0, checksum=False)
+_UNFINISHED = "unfinished_maps"
+"""Attribute: maps that are being added."""
 _METADATA = "zarr.json"
 """The group's metadata file, attributes included (Zarr v3)."""
 
@@ -49,18 +44,20 @@ COORDINATES: dict[str, dict[str, Any]] = {
     "x": {"long_name": "column in the reference image, to the right", "units": "px"},
 }
 
-TIME: dict[str, Any] = {"long_name": "time of the results, by the measured stamps", "units": "s"}
+TIME: dict[str, Any] = {"long_name": "time of the results", "units": "s"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ResultStore:
-    """An open results store. ``frames``, ``y``, ``x``: coordinates of the axes t, y, x; ``names``: its maps."""
+    """An open results store. ``frames``, ``y``, ``x``: coordinates of the axes t, y, x; ``names``: its maps, but for
+    those that an interrupted ``leafflow-ti growth`` has left ``unfinished``."""
 
     path: Path
     frames: tuple[int, ...]
     y: NDArray[np.int64]
     x: NDArray[np.int64]
     names: tuple[str, ...]
+    unfinished: tuple[str, ...]
     unit_rows: int
     _group: zarr.Group
     _arrays: Mapping[str, zarr.Array[Any]]
@@ -97,7 +94,7 @@ class ResultStore:
         if chunk[0] != 1 or not 1 <= chunk[1] <= shape[1] or chunk[2] != shape[2]:
             raise ValueError(f"chunk {chunk} must be (1, 1..{shape[1]}, {shape[2]}): whole rows of one frame")
         _check_replaceable(path, overwrite)
-        with _writing(path):
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             scratch = path.with_name(f".{path.name}.{os.getpid()}")
             try:
@@ -138,8 +135,10 @@ class ResultStore:
             )
         arrays = dict(group.arrays())
         t, y, x = (np.asarray(arrays[axis][...], np.int64) for axis in ("t", "y", "x"))
-        names = tuple(n for n in with_std(QUANTITIES) if n in arrays)
-        return cls(path, tuple(t.tolist()), y, x, names, arrays["status"].chunks[1], group, arrays)
+        unfinished: Any = group.attrs.get(_UNFINISHED, [])
+        known = [n for n in with_std(QUANTITIES) if n in arrays]
+        names, left = (tuple(n for n in known if (n in unfinished) == out) for out in (False, True))
+        return cls(path, tuple(t.tolist()), y, x, names, left, arrays["status"].chunks[1], group, arrays)
 
     @property
     def attrs(self) -> dict[str, Any]:
@@ -148,16 +147,18 @@ class ResultStore:
         return found
 
     def update_attrs(self, attrs: Mapping[str, Any]) -> None:
-        """Set attributes; whoever reads meanwhile, or after a kill, finds the old ones or the new ones.
+        """Set attributes, None removes one; whoever reads meanwhile, or after a kill, finds the old ones or the new
+        ones.
 
         Raises RunError when the store cannot be written.
         """
-        with _writing(self.path):
+        with writing(self.path):
             metadata = json.loads((self.path / _METADATA).read_text(encoding="utf-8"))
-            metadata["attributes"].update(attrs)
+            found = metadata["attributes"] | dict(attrs)
+            metadata["attributes"] = {name: value for name, value in found.items() if value is not None}
             scratch = self.path / "status" / ".done" / f".{_METADATA}"
             scratch.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
-            _flush(scratch)
+            flush(scratch)
             scratch.replace(self.path / _METADATA)
 
     @property
@@ -211,42 +212,17 @@ class ResultStore:
         wrong = [name for name, values in arrays.items() if values.shape != shape]
         if wrong:
             raise ValueError(f"unit {unit} needs the shape {shape}; {wrong[0]} has {arrays[wrong[0]].shape}")
-        with _writing(self.path):
-            with ThreadPoolExecutor(WRITERS) as pool:
-                for _ in pool.map(lambda item: self._write_chunk(t_index, band, *item), arrays.items()):
-                    pass
+        write_chunks(self.path, (t_index, band), self._arrays, arrays)
+        with writing(self.path):
             self._mark(unit)
-
-    def _write_chunk(self, t_index: int, band: int, name: str, values: NDArray[Any]) -> None:
-        """Write one chunk file as the format prescribes, forced to the disk, without the library's own threads.
-
-        The last band's chunk is filled up to the height of the others; one that holds nothing but the fill value has
-        no file.
-        """
-        array = self._arrays[name]
-        if array.compressors != (_COMPRESSOR,) or array.filters:
-            raise RunError(f"{self.path}: {name} is stored in a way that this program does not write: use --overwrite")
-        chunk = np.full(array.chunks[1:], array.fill_value, array.dtype)
-        chunk[: len(values)] = values
-        folder = self.path / name / "c" / str(t_index) / str(band)
-        if np.array_equal(chunk, np.broadcast_to(array.fill_value, chunk.shape), equal_nan=chunk.dtype.kind == "f"):
-            (folder / "0").unlink(missing_ok=True)
-            return
-        folder.mkdir(parents=True, exist_ok=True)
-        scratch = folder / ".0"
-        with scratch.open("wb") as file:
-            file.write(Zstd(level=_COMPRESSOR.level).encode(chunk.astype(chunk.dtype.newbyteorder("<"), copy=False)))
-            file.flush()
-            os.fsync(file.fileno())
-        scratch.replace(folder / "0")
 
     def _mark(self, unit: int) -> None:
         folder = self.path / "status" / ".done"
         scratch = folder / f".{unit}.{os.getpid()}"
         scratch.touch()
-        _flush(scratch)
+        flush(scratch)
         scratch.replace(folder / str(unit))
-        _flush(folder)
+        flush(folder)
 
     def done(self) -> set[int]:
         """Units whose marker is written."""
@@ -276,7 +252,7 @@ class ResultStore:
         except ImportError:
             raise MissingExtra("xarray", "xarray", "ResultStore.to_xarray") from None
         dataset: xarray.Dataset = xarray.open_zarr(self.path, consolidated=False, chunks=None)
-        return dataset
+        return dataset.drop_vars(self.unfinished)
 
     def _repr_html_(self) -> str:
         """The middle one of the frames that are done, and how many are."""
@@ -293,27 +269,48 @@ class ResultStore:
         size = f"{len(self.frames)} x {self.y.size} x {self.x.size} (t, y, x)"
         return f"<ResultStore {self.path.name}, {size}, {len(self.done())} of {self.n_units} units done: {names}>"
 
-    def add_maps(self, names: Sequence[str], attrs: Mapping[str, Any]) -> ResultStore:
-        """The store with further maps, empty (those it has lose their values), to be filled by ``write_map``.
+    def add_maps(self, names: Sequence[str]) -> ResultStore:
+        """The store with further maps, empty (those it has lose their values), to be filled by ``write_maps``.
 
-        For what follows from the measured maps; ``attrs`` say how. Raises RunError when units are missing or the store
-        cannot be written.
+        For what follows from the measured maps. They are ``unfinished``, and nobody's to read, until ``finish_maps``.
+        Raises RunError when units are missing or the store cannot be written.
         """
         self._check_whole()
         array = self._arrays["status"]
-        with _writing(self.path):
+        self.update_attrs({_UNFINISHED: list(names)})
+        with writing(self.path):
             for name in names:
                 _create_map(self._group, name, f"{name}_std" in names, array.shape, array.chunks)
-        self.update_attrs(attrs)
         return ResultStore.open(self.path)
 
-    def write_map(self, name: str, t_index: int, values: NDArray[Any]) -> None:
-        """Write a map ``[y, x]`` of the frame with index ``t_index`` along t; RunError when that is impossible."""
-        if values.shape != (self.y.size, self.x.size):
-            raise ValueError(f"{name} needs the shape {(self.y.size, self.x.size)}; got {values.shape}")
-        with _writing(self.path):
-            for band in range(self.bands):
-                self._write_chunk(t_index, band, name, values[band * self.unit_rows : (band + 1) * self.unit_rows])
+    def finish_maps(self, attrs: Mapping[str, Any]) -> ResultStore:
+        """The store with the added maps among its ``names``; ``attrs`` say how they were made."""
+        self.update_attrs({**attrs, _UNFINISHED: None})
+        return ResultStore.open(self.path)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What whoever uses the results must be told: units that are not done, maps that are ``unfinished``."""
+        found = []
+        missing = self.n_units - len(self.done())
+        if missing:
+            found.append(f"{missing} of {self.n_units} units of {self.path} are not done: their pixels have no values")
+        if self.unfinished:
+            found.append(
+                f"'leafflow-ti growth {self.path}' did not come to its end, so its maps ({self.unfinished[0]} and "
+                "others) are left out: run it again"
+            )
+        return tuple(found)
+
+    def write_maps(self, t_index: int, maps: Mapping[str, NDArray[Any]]) -> None:
+        """Write maps ``[y, x]`` of the frame with index ``t_index`` along t; RunError when that is impossible."""
+        shape = (self.y.size, self.x.size)
+        wrong = [name for name, values in maps.items() if values.shape != shape]
+        if wrong:
+            raise ValueError(f"{wrong[0]} needs the shape {shape}; got {maps[wrong[0]].shape}")
+        for band in range(self.bands):
+            rows = slice(band * self.unit_rows, (band + 1) * self.unit_rows)
+            write_chunks(self.path, (t_index, band), self._arrays, {n: values[rows] for n, values in maps.items()})
 
     def _check_whole(self) -> None:
         missing = self.n_units - len(self.done())
@@ -339,7 +336,7 @@ def _create_map(group: zarr.Group, name: str, has_std: bool, shape: tuple[int, .
         fill_value=empty_map(name, ()).item(),
         dimension_names=list(COORDINATES),
         attributes=attributes,
-        compressors=_COMPRESSOR,
+        compressors=COMPRESSOR,
         filters=None,
         overwrite=True,
     )
@@ -361,23 +358,3 @@ def _check_replaceable(path: Path, overwrite: bool) -> None:
         raise UsageError(f"{path} exists: give --overwrite to replace it, --resume to continue it, or another name")
     if _open_group(path) is None:
         raise UsageError(f"{path} exists and is no results store, so --overwrite leaves it alone: give another name")
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise RunError(f"{path}: cannot be written ({reason}): mend that, then run again with --resume") from error
-
-
-def _flush(path: Path) -> None:
-    """Force a file, or the entries of a folder, to the disk."""
-    if path.is_dir() and os.name == "nt":  # Windows opens no folders and needs no such step
-        return
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -31,9 +31,7 @@ from leafflow_ti.status import Status
 Array = NDArray[np.float64]
 
 ATTRIBUTE = "growth"
-"""Attribute of the store: the settings, and whether all frames have been written."""
-INDEPENDENT = 0.1
-"""Correlation of errors below which estimates count as independent."""
+"""Attribute of the store: the settings."""
 VELOCITY = MOTION_NAMES[:3]
 _NEEDED = ("depth", *with_std(VELOCITY), *CORRELATIONS)
 _WANTED = ("slope_x", "slope_y", "growth_rate", "growth_rate_std")
@@ -95,17 +93,15 @@ def measure_growth(
     noise = _correlation(store)
     gauge = _gauge(store, noise, strain_window)
     _check_average(average, len(store.frames))
-    settings: dict[str, Any] = {"strain_window_px": gauge.side, "average_frames": average, "complete": False}
-    store = store.add_maps(with_std(SURFACE_NAMES), {ATTRIBUTE: settings})
+    store = store.add_maps(with_std(SURFACE_NAMES))
     summary = _Summary()
     for t_index, (strain, rate, std) in enumerate(_averaged(store, gauge, noise, average)):
         maps = strain.maps()
-        for name, values in maps.items():
-            store.write_map(name, t_index, values.astype(np.float32))
+        store.write_maps(t_index, {name: values.astype(np.float32) for name, values in maps.items()})
         summary.add(maps, rate, std)
         if progress:
             progress(t_index + 1, len(store.frames))
-    store.update_attrs({ATTRIBUTE: settings | {"complete": True}})
+    store.finish_maps({ATTRIBUTE: {"strain_window_px": gauge.side, "average_frames": average}})
     found = summary.maps(), summary.agreement()
     return GrowthSummary(str(store.path), gauge.side, average, len(store.frames), store.interval_s, *found)
 
@@ -130,8 +126,7 @@ def _correlation(store: ResultStore) -> NoiseCorrelation:
 
 def default_window(noise: NoiseCorrelation, pitch: int) -> int:
     """Side [px] of the window that holds three by three estimates whose errors are independent."""
-    far = max(int(np.flatnonzero(r >= INDEPENDENT).max()) + 1 for r in (noise.x, noise.y))
-    return 2 * far * pitch + 1
+    return 2 * max(noise.independent("x"), noise.independent("y")) * pitch + 1
 
 
 def _gauge(store: ResultStore, noise: NoiseCorrelation, window: int | None) -> Gauge:
@@ -162,7 +157,8 @@ def _check_average(average: int, frames: int) -> None:
     if average < 1 or average % 2 == 0:
         raise UsageError(f"average {average}: choose an odd number of frames, each with as many before as behind")
     if average > 1 and average > frames:
-        raise UsageError(f"average {average}: the results hold {frames} frames: choose --average {frames} at most")
+        most = frames - (frames + 1) % 2
+        raise UsageError(f"average {average}: the results hold {frames} frames: choose --average {most} at most")
 
 
 def _averaged(

@@ -6,9 +6,7 @@ where a value is missing.
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -16,7 +14,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.errors import MissingExtra, RunError, UsageError
+from leafflow_ti.errors import MissingExtra, UsageError
+from leafflow_ti.whole import appearing
 
 if TYPE_CHECKING:
     import pandas
@@ -60,9 +59,7 @@ def write_table(columns: Columns, path: str | Path, overwrite: bool = False) -> 
     Raises like ``check_table_path``, and RunError when it cannot be written.
     """
     path = check_table_path(path, overwrite)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with appearing(path) as scratch:
         if path.suffix.lower() == ".csv":
             with scratch.open("w", newline="", encoding="utf-8") as file:
                 write_rows(file, columns)
@@ -70,12 +67,6 @@ def write_table(columns: Columns, path: str | Path, overwrite: bool = False) -> 
             arrow, parquet = _parquet()
             table = arrow.table({name: arrow.array(values, from_pandas=True) for name, values in columns.items()})
             parquet.write_table(table, scratch)
-        scratch.replace(path)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written ({error.strerror or error}): mend that, or another name") from error
-    finally:
-        with contextlib.suppress(OSError):
-            scratch.unlink(missing_ok=True)
     return path
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -13,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.errors import MissingExtra, RunError, UsageError
+from leafflow_ti.errors import MissingExtra, UsageError
 from leafflow_ti.interpolation import Reading
 from leafflow_ti.tables import SUFFIXES, check_table_path, column_name, write_table
+from leafflow_ti.whole import appearing
 
 if TYPE_CHECKING:
     import xarray
@@ -210,26 +209,13 @@ class Tracks:
         if path.suffix.lower() in SUFFIXES:
             write_table(self.columns(), path, overwrite)
             return
-        scratch = path.with_name(f".{path.name}.{os.getpid()}{path.suffix}")
         data = self.to_xarray()
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        with appearing(path) as scratch:
             if path.suffix.lower() == ".zarr":
                 data.to_zarr(scratch, mode="w", zarr_format=3, consolidated=False)
-                if path.exists():
-                    shutil.rmtree(path)
             else:
                 packed = {name: {"zlib": True, "complevel": 4} for name in data.data_vars}
                 data.to_netcdf(scratch, engine="h5netcdf", encoding=packed)
-            scratch.replace(path)
-        except OSError as error:
-            raise RunError(
-                f"{path}: cannot be written ({error.strerror or error}): mend that, or another name"
-            ) from error
-        finally:
-            if scratch.is_dir():
-                shutil.rmtree(scratch, ignore_errors=True)
-            scratch.unlink(missing_ok=True)
 
 
 def check_path(path: str | Path, overwrite: bool = False) -> Path:
@@ -252,8 +238,9 @@ def check_path(path: str | Path, overwrite: bool = False) -> Path:
     if suffix == ".nc":
         try:
             import h5netcdf  # noqa: F401
-        except ImportError:
-            raise MissingExtra("h5netcdf", "netcdf", "writing NetCDF") from None
+            import h5py  # noqa: F401
+        except ImportError as error:
+            raise MissingExtra(str(error.name).partition(".")[0], "netcdf", "writing NetCDF") from None
     return path
 
 

@@ -31,6 +31,7 @@ def attributes(refined: bool = True) -> dict[str, Any]:
     return {
         "config": f"[refine]\nsteps = {3 if refined else 0}\n[window]\nsize = 33\n",
         "plan": {"f_px": F_PX, "principal_px": list(PRINCIPAL), "image_px": list(SIZE), "time_offset": 0.0,
+                 "baseline_mm": [10.0, 0.0],
                  "noise_correlation": CORRELATION},
     }  # fmt: skip
 

@@ -335,7 +335,7 @@ def test_demo_prints_what_it_does(
     real(["demo", str(tmp_path / "d"), *flags])
     printed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("$ leafflow-ti ")]
     assert printed == [f"$ leafflow-ti {' '.join(step)}" for step in steps]
-    assert [step[0] for step in steps] == ["simulate", "run", "evaluate", "report"]
+    assert [step[0] for step in steps] == ["simulate", "run", "growth", "evaluate", "export", "report"]
     assert size in steps[0]
 
 

@@ -84,7 +84,7 @@ def test_hours_count_from_frame_0_without_a_clock() -> None:
 
 def test_less_than_a_day_says_so() -> None:
     curves = fold(table(days=0.5))
-    assert "less than a day: no hour is seen twice" in curves.describe()
+    assert "less than a day: every hour is seen once at most" in curves.describe()
     rows = curves.of(1)
     np.testing.assert_array_equal(rows["hour_start"], np.arange(6, 18))  # no rows for hours that were not seen
     assert np.isnan(rows["growth_days_sd_percent_per_h"]).all()
@@ -163,4 +163,4 @@ def test_no_values_make_no_curve(tmp_path: Path) -> None:
     curves = fold(RegionTable({**given.columns, "growth_percent_per_h": nothing}, correlation=given.correlation))
     assert isinstance(curves, DielCurves)
     assert curves.of(1)["hour_start"].size == 0
-    assert "0 bins with values" in curves.describe()
+    assert "0 bins from" in curves.describe()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from flat_leaf import X, Y, attributes, write_store
 from numpy.typing import NDArray
 
 from leafflow_ti.cli.main import main
@@ -23,7 +24,6 @@ from leafflow_ti.field import with_std
 from leafflow_ti.mesh import surface_mesh
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
-from tests.flat_leaf import X, Y, attributes, write_store
 
 NAMES = (*with_std(("depth", "slope_x", "slope_y", "velocity_x", "velocity_y", "velocity_z", "acceleration_x",
                     "growth_rate")), "identified")  # fmt: skip

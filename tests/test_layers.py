@@ -16,7 +16,7 @@ import leafflow_ti
 PACKAGE = Path(leafflow_ti.__file__).parent
 
 LAYERS: dict[str, int] = {
-    **dict.fromkeys(("errors", "status", "progress", "trace", "background", "number_text"), 1),
+    **dict.fromkeys(("errors", "status", "progress", "trace", "background", "number_text", "whole", "chunk_files"), 1),
     **dict.fromkeys(("kernels",), 2),
     **dict.fromkeys(
         (

@@ -10,6 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from flat_leaf import (
+    CORRELATION,
+    DEPTH,
+    F_PX,
+    LEAF,
+    PRINCIPAL,
+    SIZE,
+    X,
+    Y,
+    attributes,
+    leaf_maps,
+    write_store,
+)  # fmt: skip
 from numpy.typing import NDArray
 
 from leafflow_ti.cli.main import main
@@ -28,19 +41,6 @@ from leafflow_ti.regions import RegionTable, measure_regions
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
 from leafflow_ti.surface_growth import strain_of
-from tests.flat_leaf import (
-    CORRELATION,
-    DEPTH,
-    F_PX,
-    LEAF,
-    PRINCIPAL,
-    SIZE,
-    X,
-    Y,
-    attributes,
-    leaf_maps,
-    write_store,
-)  # fmt: skip
 
 GROWTH, FLOW = 0.01, (2.5, -1.0)
 MM2 = (DEPTH / F_PX) ** 2

@@ -236,7 +236,7 @@ def test_a_few_bad_pixels_do_not_spoil_the_mean(tmp_path: Path) -> None:
     for name, value in (("growth_rate", -50 * GROWTH), ("growth_rate_std", 1000 * GROWTH_STD)):
         values = store.read(name, 0)
         values[15, 20] = value
-        store.write_map(name, 0, values)
+        store.write_maps(0, {name: values})
     after = facts.Facts.of(store).growth[0]
     assert after.mean == pytest.approx(before.mean, rel=1e-3)
     assert after.error == pytest.approx(before.error, rel=0.01)

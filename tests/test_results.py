@@ -242,9 +242,15 @@ def test_maps_are_added_to_a_whole_store(full: ResultStore) -> None:
     before = files(full.path)
     values = np.random.default_rng(1).normal(size=(Y.size, X.size)).astype(np.float32)
     for _ in range(2):  # the second time replaces the first
-        store = full.add_maps(("area_rate", "area_rate_std"), {"growth": {"window": 5}})
-        assert np.isnan(store.read("area_rate")).all()
-        store.write_map("area_rate", 1, values)
+        store = full.add_maps(("area_rate", "area_rate_std"))
+        assert store.names == NAMES
+        assert store.unfinished == ("area_rate", "area_rate_std")
+        (remark,) = store.remarks
+        assert "area_rate and others) are left out: run it again" in remark
+        store.write_maps(1, {"area_rate": values})
+        store = store.finish_maps({"growth": {"window": 5}})
+        assert (store.unfinished, store.remarks) == ((), ())
+        assert "unfinished_maps" not in store.attrs
     assert store.names == (*NAMES, "area_rate", "area_rate_std")
     assert store.attrs["growth"] == {"window": 5}
     np.testing.assert_array_equal(store.read("area_rate", 1), values)
@@ -253,12 +259,12 @@ def test_maps_are_added_to_a_whole_store(full: ResultStore) -> None:
         name: data for name, data in before.items() if name != "zarr.json"
     }
     with pytest.raises(ValueError, match="needs the shape"):
-        store.write_map("area_rate", 1, values[1:])
+        store.write_maps(1, {"area_rate": values[1:]})
 
 
 def test_maps_are_not_added_to_an_unfinished_store(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="6 of 6 units are not done"):
-        make(tmp_path / "out.zarr").add_maps(("area_rate",), {})
+        make(tmp_path / "out.zarr").add_maps(("area_rate",))
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def test_exact_motion_gives_exact_strain(tmp_path: Path, strains: dict[str, floa
     summary = lf.measure_growth(store_of(tmp_path / "o.zarr", None))
     store = ResultStore.open(tmp_path / "o.zarr")
     assert set(with_std(SURFACE_NAMES)) <= set(store.names)
-    assert store.attrs[ATTRIBUTE] == {"strain_window_px": summary.window_px, "average_frames": 1, "complete": True}
+    assert store.attrs[ATTRIBUTE] == {"strain_window_px": summary.window_px, "average_frames": 1}
     for t in range(len(FRAMES)):
         assert np.isnan(store.read("area_rate", t)[:, :2]).all()
         for name, value in strains.items():

@@ -16,13 +16,15 @@ SMALL: tuple[list[str], list[str]] = (["--size", "400x260"], ["--window", "41"])
 FULL: tuple[list[str], list[str]] = (["--size", "301x301"], [])
 """Options of ``simulate cube`` and of ``run``; the full one has the window and image size of the
 dissertation. All else is the default, refinement included."""
+Step = tuple[str, list[str]]
+"""What is done, and the command line that does it."""
 
 
 def demo(
     folder: Annotated[Path, typer.Argument(metavar="OUTDIR", help="Folder to create.")] = Path("leafflow-demo"),
     full: Annotated[bool, typer.Option("--full", help="Images of 301 x 301 px, window of 65 px.")] = False,
 ) -> None:
-    """Simulate a rotating cube, measure it, compare with the truth, write a report.
+    """Simulate a rotating cube, measure it, compare with the truth, export its surface, write a report.
 
     Nine cameras see nine frames of a textured cube that turns by 0.4 degrees and moves by 1 mm per frame.
     """
@@ -32,21 +34,28 @@ def demo(
         raise UsageError(f"{folder} exists and is not empty: remove it, or name another folder")
     scene, settings = FULL if full else SMALL
     pictures = importlib.util.find_spec("matplotlib") is not None
-    capture, out, page = folder / "cube", folder / "cube.zarr", folder / "cube.html"
-    for title, arguments in (
+    capture, out, mesh, page = (folder / name for name in ("cube", "cube.zarr", "cube-vtk", "cube.html"))
+    steps: list[Step] = [
         ("A synthetic capture with its exact truth", ["simulate", "cube", str(capture), *scene]),
         (
             "Depth, normals, 3D motion and growth, refined on the exact patch",
             ["run", str(capture), "-o", str(out), *settings],
         ),
-        ("Compared with the truth", ["evaluate", str(out), "--truth", str(capture / "truth.npz")]),
-        *([("All of it on one page", ["report", str(out), "-o", str(page)])] if pictures else []),
-    ):
+        ("Growth once more, from the motion on the surface: a cube does not grow", ["growth", str(out)]),
+        (
+            "Compared with the truth, away from the cube's edges",
+            ["evaluate", str(out), "--truth", str(capture / "truth.npz"), "--interior"],
+        ),
+        ("The surface for ParaView", ["export", str(out), "--to", "vtk", "-o", str(mesh)]),
+    ]
+    if pictures:
+        steps.append(("All of it on one page", ["report", str(out), "-o", str(page)]))
+    for title, arguments in steps:
         typer.echo(f"\n# {title}\n$ leafflow-ti {shlex.join(arguments)}")
         invoke(arguments)
     typer.echo("\n# Look at")
+    typer.echo(f"{out}  (leafflow-ti info {shlex.quote(str(out))})\n{mesh / 'series.pvd'}  (in ParaView)")
     if pictures:
-        typer.echo(f"{page}  (in any browser)\n{quicklook_folder(out) / 'overview.png'}")
+        typer.echo(f"{quicklook_folder(out) / 'overview.png'}\n{page}  (in any browser)")
     else:
         typer.echo("no report, no pictures: they need matplotlib (pip install 'leafflow-ti[plot]')")
-    typer.echo(f"{out}  (leafflow-ti info {shlex.quote(str(out))})")

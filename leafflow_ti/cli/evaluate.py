@@ -38,6 +38,9 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    interior: Annotated[
+        bool, typer.Option("--interior", help="Tell of the regions without their borders alone.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Compare results with a known truth.
@@ -59,6 +62,10 @@ def evaluate(
     if margin is None:
         margin = window_size(store.attrs) // 2
     regions = {name: mask[field.y][:, field.x] for name, mask in metrics.label_regions(known, margin).items()}
+    if interior:
+        regions = {name: mask for name, mask in regions.items() if name.endswith(metrics.INTERIOR)}
+        if not regions:
+            raise UsageError(f"--interior: {truth} labels no regions, or the margin is 0: leave it out")
     reports = metrics.evaluate(field, metrics.sample_maps(known, field.y, field.x), regions)
     if as_json:
         facts = {
@@ -88,19 +95,19 @@ def format_reports(reports: Mapping[str, RegionReport]) -> list[str]:
     for region, report in reports.items():
         lines += ["", f"{region}: {report.pixels} px with truth"]
         lines.append(
-            f"  {'error':<26}{'pixels':>9}{'mean':>12}{'std':>11}{'median':>12}{'median |.|':>12}{'95% |.|':>11}"
+            f"  {'error':<30}{'pixels':>9}{'mean':>12}{'std':>11}{'median':>12}{'median |.|':>12}{'95% |.|':>11}"
         )
         for name, e in report.errors.items():
             lines.append(
-                f"  {title(name):<26}{e.n:>9}{e.mean:>12.4g}{e.std:>11.3g}{e.median:>12.4g}"
+                f"  {title(name):<30}{e.n:>9}{e.mean:>12.4g}{e.std:>11.3g}{e.median:>12.4g}"
                 f"{e.median_abs:>12.4g}{e.p95_abs:>11.3g}"
             )
         if report.coverage:
             lines.append(
-                f"  {'(estimate - truth)/std':<26}{'pixels':>9}{'mean':>12}{'std':>11}{'within 1':>12}{'2 std':>12}"
+                f"  {'(estimate - truth)/std':<30}{'pixels':>9}{'mean':>12}{'std':>11}{'within 1':>12}{'2 std':>12}"
             )
         for name, c in report.coverage.items():
-            lines.append(f"  {name:<26}{c.n:>9}{c.mean:>12.3f}{c.std:>11.3f}{c.within_1:>12.1%}{c.within_2:>12.1%}")
+            lines.append(f"  {name:<30}{c.n:>9}{c.mean:>12.3f}{c.std:>11.3f}{c.within_1:>12.1%}{c.within_2:>12.1%}")
     return lines
 
 

@@ -35,9 +35,13 @@ def export(
     other names a folder.
     """
     from leafflow_ti.exporters import export as write
+    from leafflow_ti.results import ResultStore
 
+    store = ResultStore.open(result)
     names = None if maps is None else [name.strip() for name in maps.split(",") if name.strip()]
-    written = write(result, to, output, frames=frames, maps=names, overwrite=overwrite)
+    written = write(store, to, output, frames=frames, maps=names, overwrite=overwrite)
     size = sum(path.stat().st_size for path in written)
     files = "1 file" if len(written) == 1 else f"{len(written)} files"
+    for remark in store.remarks:
+        typer.echo(f"note: {remark}")
     typer.echo(f"{output}: {files}, {size / 2**20:.3g} MiB")

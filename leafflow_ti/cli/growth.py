@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from leafflow_ti.cli.progress import counted
+
 if TYPE_CHECKING:
     from leafflow_ti.surface_growth import GrowthSummary
 
@@ -40,7 +42,11 @@ def growth(
     """
     from leafflow_ti.surface_growth import measure_growth
 
-    summary = measure_growth(result, strain_window, average)
+    try:
+        summary = measure_growth(result, strain_window, average, counted("frame"))
+    except KeyboardInterrupt:
+        typer.echo("interrupted: maps that are not whole are left out until the same command has run again", err=True)
+        raise
     if as_json:
         typer.echo(json.dumps(summary.to_json(), indent=2, ensure_ascii=False))
     else:
@@ -52,9 +58,9 @@ def format_growth(summary: GrowthSummary) -> list[str]:
     from leafflow_ti.field import quantity
     from leafflow_ti.rates import per_hour
 
-    over = f", means over {summary.average} frames" if summary.average > 1 else ""
+    over = f"s, means over {summary.average} frames" if summary.average > 1 else "s" * (summary.frames > 1)
     lines = [
-        f"{summary.path}: strain in windows of {summary.window_px} px, {summary.frames} frames{over}",
+        f"{summary.path}: strain in windows of {summary.window_px} px, {summary.frames} frame{over}",
         f"  {'median over pixels and frames':<30}{'value':>11}{'std error':>11}  {'unit':<10}{'pixels':>7}",
     ]
     for name, found in summary.maps.items():

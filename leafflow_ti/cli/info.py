@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from leafflow_ti.capture import FileCapture
     from leafflow_ti.results import ResultStore
 
+LISTED = 9
+"""Most numbers of a list that are printed."""
+
 
 def info(
     path: Annotated[Path, typer.Argument(metavar="CAPTURE|OUT.zarr", help="A capture.toml or its folder, or results.")],
@@ -216,6 +219,7 @@ def store_facts(store: ResultStore) -> dict[str, Any]:
         "interval_s": store.interval_s,
         "units_done": len(store.done()),
         "units": store.n_units,
+        "remarks": list(store.remarks),
         "maps_of_frame": store.frames[middle],
         "maps": maps,
         "status": counts,
@@ -232,6 +236,7 @@ def _store_lines(facts: dict[str, Any]) -> list[str]:
         f"maps         {facts['rows']} x {facts['columns']} (y, x), "
         f"pixels x {_range(facts['x_px'])}, y {_range(facts['y_px'])}",
         f"units        {done} of {units} done" + ("" if done == units else ": go on with run --resume"),
+        *(f"note         {remark}" for remark in facts["remarks"]),
         *_timing_lines(facts["attributes"].get("timings")),
         "",
         f"status of the pixels of {'all frames' if len(facts['frames']) > 1 else 'the frame'}",
@@ -272,7 +277,14 @@ def _indented(value: object) -> list[str]:
             for line in (
                 [f"  {key}", *(f"  {x}" for x in _indented(inner))]
                 if isinstance(inner, dict)
-                else [f"  {key}: {inner}"]
+                else [f"  {key}: {_brief(inner)}"]
             )
         ]
     return [f"  {line}" for line in str(value).splitlines()]
+
+
+def _brief(value: object) -> object:
+    """A value of an attribute; of a long list the first numbers, --json has them all."""
+    if isinstance(value, list) and len(value) > LISTED:
+        return f"[{', '.join(str(one) for one in value[:LISTED])}, ... {len(value)} in all]"
+    return value

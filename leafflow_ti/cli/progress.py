@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from typing import TextIO
 
 from leafflow_ti.number_text import duration
@@ -28,6 +29,18 @@ def format_progress(progress: Progress) -> str:
     if progress.pixels_per_second is not None and progress.seconds_left is not None:
         parts += [format_rate(progress.pixels_per_second), f"{duration(round(progress.seconds_left))} left"]
     return ", ".join(parts)
+
+
+def counted(what: str) -> Callable[[int, int], None] | None:
+    """Shows ``image 3/12`` on standard error, rewritten, where that is a terminal; None elsewhere."""
+    if not sys.stderr.isatty():
+        return None
+
+    def show(done: int, total: int) -> None:
+        sys.stderr.write(f"\r{what} {done}/{total}" + ("\n" if done == total else ""))
+        sys.stderr.flush()
+
+    return show
 
 
 class ProgressLine:

@@ -46,25 +46,30 @@ def regions(
     is a missing value. A label image holds for one frame and follows the leaves through the others; a TIFF with one
     page per frame of the results holds for all.
     """
-    from leafflow_ti.diel import fold, parse_light, write_diel_figure
+    from leafflow_ti.diel import check_figure_path, fold, parse_light, write_diel_figure
     from leafflow_ti.regions import measure_regions
     from leafflow_ti.tables import check_table_path
 
     hours = None if light is None else parse_light(light)
     if hours is not None and diel_figure is None:
         raise UsageError("--light shades the night in a figure: give --diel-figure FILE.png, too")
+    wanted = [path for path in (output, diel, diel_figure) if path is not None]
+    if len({path.absolute() for path in wanted}) < len(wanted):
+        raise UsageError("the table, the diel curve and its figure are files of their own: give different names")
     for path in (output, diel):
         if path is not None:
             check_table_path(path, overwrite)
+    if diel_figure is not None:
+        check_figure_path(diel_figure, overwrite)
     table = measure_regions(result, labels, labels_frame=labels_frame, still=still, start_time=start_time)
+    curves = None if diel is None and diel_figure is None else fold(table, bin_h)
     table.to_csv(output, overwrite)
     typer.echo("\n".join(table.summary()))
     for note in table.notes:
         typer.echo(f"note: {note}")
     typer.echo(f"table: {output}, {len(table)} rows")
-    if diel is None and diel_figure is None:
+    if curves is None:
         return
-    curves = fold(table, bin_h)
     typer.echo(curves.describe())
     if diel is not None:
         typer.echo(f"diel curve: {curves.to_csv(diel, overwrite)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from leafflow_ti.cli.progress import counted
 from leafflow_ti.cli.scene_fields import FIELDS, numbers
 
 if TYPE_CHECKING:
@@ -320,7 +320,7 @@ def _write(default: Scene, context: typer.Context) -> None:
         changes["centre"] = _centre(default, given)
     scene = replace(default, **changes)
     folder: Path = given["folder"]
-    write_scene(scene, folder, given.get("interval_s"), _show_progress if sys.stderr.isatty() else None)
+    write_scene(scene, folder, given.get("interval_s"), counted("image"))
     typer.echo(
         f"{folder}: {scene.n_frames} frames of {scene.n_rows} x {scene.n_cols} cameras (rows x columns), "
         f"{scene.size[0]} x {scene.size[1]} px, {scene.bits or 'float'}{' bits' if scene.bits else ''}; "
@@ -348,8 +348,3 @@ def _whole_disparity(scene: Scene) -> tuple[int, int]:
     counts = (scene.n_cols, scene.n_rows)
     nx, ny = (round(-scene.f_px * b / centre[2]) * (n > 1) for b, n in zip(scene.baseline_mm, counts, strict=True))
     return nx, ny
-
-
-def _show_progress(done: int, total: int) -> None:
-    sys.stderr.write(f"\rimage {done}/{total}" + ("\n" if done == total else ""))
-    sys.stderr.flush()

@@ -81,16 +81,21 @@ def track(
     way = None if axis is None else _axis(axis)
     check_path(out, overwrite)
     store = ResultStore.open(result)
+    if len(store.frames) == 1:
+        raise InputError(f"{store.path}: holds one frame, so there is nothing to follow: measure a sequence")
     start = store.frames[0] if start is None else start
     x, y = _grid(store, grid, start) if points is None else _read_points(points)
     tracks = follow(store, x, y, start, max_drift=MAX_DRIFT if max_drift is None else max_drift)
+    if not tracks.known[tracks.start_index].any():
+        raise InputError(f"{points}: none of these points is measured in frame {start}: give points on the leaves")
     if labels is not None:
         tracks = _labelled(tracks, store, labels)
     tracks = track_growth(store, tracks, gauge)
     if way is not None:
         tracks = leaf_coordinates(store, tracks, way)
     tracks.save(out, overwrite)
-    typer.echo("\n".join([*format_tracks(tracks, store.interval_s), f"tracks: {out}"]))
+    notes = (f"note: {remark}" for remark in store.remarks)
+    typer.echo("\n".join([*format_tracks(tracks, store.interval_s), *notes, f"tracks: {out}"]))
 
 
 def _axis(text: str) -> str | list[tuple[float, float]]:
@@ -118,13 +123,16 @@ def _grid(store: ResultStore, spacing: int | None, start: int) -> Points:
     if spacing is not None and spacing < 1:
         raise UsageError(f"--grid {spacing}: must be 1 px or more")
     if start not in store.frames:
-        raise UsageError(f"--start {start}: the results hold the frames {store.frames[0]}..{store.frames[-1]}")
+        held = f"{store.frames[0]}..{store.frames[-1]}"
+        raise UsageError(f"--start {start}: the results hold the frames {held}: choose one of them")
     stride = int(store.x[1] - store.x[0]) if store.x.size > 1 else 1
     every = 4 if spacing is None else max(1, spacing // stride)
     measured = np.isin(store.read("status", store.frames.index(start)), [c for c in HAS_VALUE if c != Status.COARSE])
+    if not measured.any():
+        raise InputError(f"{store.path}: frame {start} has no measured pixel: choose another --start")
     rows, cols = np.nonzero(measured[::every, ::every])
     if not rows.size:
-        raise InputError(f"{store.path}: frame {start} has no measured pixel: choose another --start")
+        raise UsageError(f"--grid {spacing}: pixels so far apart miss all that is measured: choose less")
     return store.x[cols * every].astype(float), store.y[rows * every].astype(float)
 
 
@@ -178,7 +186,9 @@ def format_tracks(tracks: Tracks, interval_s: float | None) -> list[str]:
                 f"{np.quantile(drift, 0.95):.4f} px)"
             )
     label = tracks.variables.get("label")
-    groups = {"": np.ones(tracks.n_points, bool)} if label is None else {f"region {v}": label == v for v in set(label)}
+    groups = {"": np.ones(tracks.n_points, bool)}
+    if label is not None:
+        groups = {f"region {v}": label == v for v in np.unique(label)}
     for name, members in groups.items():
         lines += [f"{name:<12}{line}" for line in _growth(tracks.chosen(members), interval_s)]
     return lines

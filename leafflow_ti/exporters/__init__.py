@@ -6,18 +6,16 @@ wrote. It reads one frame at a time, so that memory does not grow with the seque
 
 from __future__ import annotations
 
-import contextlib
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol, cast
 
-from leafflow_ti.errors import InputError, RunError, UsageError
+from leafflow_ti.errors import InputError, UsageError
 from leafflow_ti.exporters.selection import Selection
 from leafflow_ti.results import ResultStore
+from leafflow_ti.whole import appearing
 
 Writer = Callable[[Selection, Path], list[Path]]
 
@@ -61,6 +59,8 @@ FORMATS: dict[str, Format] = {
     "csv": Format((".csv",), "text:write_csv_file", "text:write_csv_folder", _one),
 }
 """Name -> format."""
+FILES = {".txt", ".vtk", ".vtu", ".zarr", ".parquet"}.union(*(kind.suffixes for kind in FORMATS.values()))
+"""Suffixes that no folder of an export has: whoever names one expects a file."""
 
 
 def export(
@@ -90,19 +90,10 @@ def export(
     as_file = _as_file(kind, to, path, selection)
     _check_target(path, as_file, kind, overwrite)
     writer = _writer(kind.file if as_file else kind.folder)
-    scratch = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with appearing(path) as scratch:
         if not as_file:
             scratch.mkdir()
         written = writer(selection, scratch)
-        _remove(path)
-        scratch.rename(path)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written ({error.strerror or error}): mend that, or another path") from error
-    finally:
-        with contextlib.suppress(OSError):  # what went wrong above is what matters
-            _remove(scratch)
     return [path / file.relative_to(scratch) for file in written]
 
 
@@ -111,6 +102,10 @@ def _as_file(kind: Format, to: str, path: Path, selection: Selection) -> bool:
     if path.suffix.lower() not in kind.suffixes:
         if kind.folder is None:
             raise UsageError(f"{path}: {to} is one file: let its name end in {kind.suffixes[0]}")
+        if path.suffix.lower() in FILES:
+            raise UsageError(
+                f"{path}: no name for {to}: let that of a file end in {kind.suffixes[0]}, that of a folder in no suffix"
+            )
         return False
     if kind.file is None or kind.parts(selection) != 1:
         raise UsageError(
@@ -140,10 +135,3 @@ def _writer(place: str | None) -> Writer:
     assert place is not None
     module, _, function = place.partition(":")
     return cast(Writer, getattr(import_module(f"leafflow_ti.exporters.{module}"), function))
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

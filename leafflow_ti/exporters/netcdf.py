@@ -20,12 +20,13 @@ def write_netcdf(selection: Selection, path: Path) -> list[Path]:
     """All maps into one file, frame by frame, compressed, NaN where there is no value.
 
     ``t`` counts frames; the coordinate ``time`` [s] stands beside it where the interval or the stamps are known.
-    Raises MissingExtra where h5netcdf is not installed.
+    Raises MissingExtra where h5netcdf, or h5py that it writes with, is not installed.
     """
     try:
         import h5netcdf
-    except ImportError:
-        raise MissingExtra("h5netcdf", "netcdf", "writing NetCDF") from None
+        import h5py  # noqa: F401
+    except ImportError as error:
+        raise MissingExtra(str(error.name).partition(".")[0], "netcdf", "writing NetCDF") from None
     store = selection.store
     coordinates = {"t": np.asarray(selection.frames, np.int64), "y": store.y, "x": store.x}
     with h5netcdf.File(path, "w") as file:

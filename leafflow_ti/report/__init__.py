@@ -7,10 +7,8 @@ The page holds all it needs, asks for nothing over the network (its content poli
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import json
-import os
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -35,6 +33,7 @@ from leafflow_ti.report.sections import (
 )
 from leafflow_ti.report.surface import has_surface, packed_surfaces
 from leafflow_ti.results import ResultStore
+from leafflow_ti.whole import appearing
 
 LIMIT = 4_800_000
 """Largest page, in bytes."""
@@ -71,15 +70,8 @@ def write_report(
     _check_replaceable(path)
     curves = None if regions is None else read_region_curves(Path(regions))
     page = report_page(store, curves, title or store.path.name.removesuffix(".zarr"), frames)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with appearing(path) as scratch:
         scratch.write_text(page, encoding="utf-8")
-        scratch.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            scratch.unlink(missing_ok=True)
-        raise RunError(f"{path}: the report cannot be written ({error.strerror}): name another file") from error
     return path
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.display import Medians
-from leafflow_ti.field import WITHOUT_STD, Field
+from leafflow_ti.field import WITHOUT_STD
 from leafflow_ti.labels import Coverage
 from leafflow_ti.panels import quantity_title, shown_in
 from leafflow_ti.region_noise import RegionNoise
-from leafflow_ti.region_rows import region_row, surface_area
+from leafflow_ti.region_rows import measured, region_row, surface_area
 from leafflow_ti.region_table import over_frames
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import HAS_VALUE, Status
@@ -25,8 +25,6 @@ GROWTH = ("growth_rate", "area_rate")
 """Measures of growth whose course is shown: by the refinement, and from the motion."""
 MEASURED = tuple(code for code in HAS_VALUE if code != Status.COARSE)
 """Codes of pixels whose values have standard errors."""
-_SURFACE = ("depth", "slope_x", "slope_y", "velocity_z_std")
-"""What the area of a pixel, and the errors of a mean growth, need beside it."""
 
 Floats = NDArray[np.float64]
 
@@ -127,18 +125,15 @@ def _course(store: ResultStore, name: str, begun: Sequence[int]) -> Series:
     noise = RegionNoise.of(store)
     n = len(store.frames)
     mean, error, spread = np.full(n, np.nan), np.full(n, np.nan), np.full((2, n), np.nan)
-    needed = [key for key in (name, f"{name}_std", *_SURFACE) if key in store.names]
     for t in begun:
-        status = store.read("status", t)
-        maps = {key: np.where(status == Status.OK, store.read(key, t), np.float32(np.nan)) for key in needed}
-        field = Field(maps, status, store.y, store.x, store.frames[t], store.attrs)
+        field = measured(store, t, (name,))
         area = surface_area(field)
         found = region_row(field, area, Coverage.everywhere(field.shape), (name,), noise, t, n)
         if name in found:
             mean[t], error[t] = found[name], found[f"{name}_se"]
-            known = np.isfinite(area) & np.isfinite(maps[name]) & np.isfinite(maps[f"{name}_std"])
-            spread[:, t] = np.percentile(maps[name][known], (16, 84))
-    frames = tuple(noise.frames.tolist())
+            known = np.isfinite(area) & np.isfinite(field[name]) & np.isfinite(field[f"{name}_std"])
+            spread[:, t] = np.percentile(field[name][known], (16, 84))
+    frames = tuple(noise.over_time(name).tolist())
     return Series(
         quantity_title(name), np.array(store.frames, float), mean * factor, error * factor, spread * factor, frames
     )

@@ -36,7 +36,10 @@ def read_region_curves(path: Path) -> RegionCurves:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as a table ({error}): give a CSV of 'leafflow-ti regions'") from error
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"{path}: cannot be read as a table ({reason}): give a CSV of 'leafflow-ti regions'"
+        ) from error
     names = rows[0].keys() if rows else ()
     growth = next((columns for columns in GROWTH if set(columns[:2]) <= set(names)), None)
     if growth is None or REGION not in names or FRAME not in names:

@@ -37,6 +37,11 @@ def header(title: str, store: ResultStore, facts: Facts) -> str:
             f'<p class="warn"><b>This run is not finished:</b> {done} of {frames} frames are done{some}. The report '
             "shows what is there; <code>leafflow-ti run … --resume</code> goes on with the rest.</p>"
         )
+    if store.unfinished:
+        parts.append(
+            '<p class="warn"><b>Growth from the motion is not finished,</b> and left out: '
+            "<code>leafflow-ti growth …</code> measures it again.</p>"
+        )
     return "\n".join(parts)
 
 
