@@ -12,12 +12,13 @@ import pytest
 from test_cli import call
 
 import leafflow_ti as lf
+from leafflow_ti.cli.growth import format_growth
 from leafflow_ti.correlation import KEY, NoiseCorrelation
 from leafflow_ti.errors import InputError, LeafflowError, RunError, UsageError
 from leafflow_ti.field import CORRELATIONS, SURFACE_NAMES, empty_map, with_std
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
-from leafflow_ti.surface_growth import ATTRIBUTE, default_window, mean_over_frames
+from leafflow_ti.surface_growth import ATTRIBUTE, Agreement, GrowthSummary, default_window, mean_over_frames
 from leafflow_ti.synthetic.geometry import tangent_axes
 from leafflow_ti.synthetic.plane import PlaneScene, linear_growth
 
@@ -250,3 +251,9 @@ def test_results_without_a_surface_have_no_strain(tmp_path: Path, capsys: pytest
     assert call("growth", store.path) == 0
     assert "no pixel has a strain" in capsys.readouterr().out
     assert np.isnan(ResultStore.open(store.path).read("area_rate")).all()
+
+
+@pytest.mark.parametrize(("mean", "std", "advised"), [(0.3, 1.2, False), (0.2, 6.0, True), (-4.0, 0.9, True)])
+def test_disagreement_is_said(mean: float, std: float, advised: bool) -> None:
+    summary = GrowthSummary("out.zarr", 65, 1, 4, 600.0, {}, Agreement(900, mean, std))
+    assert ("--deformation strain" in format_growth(summary)[-1]) == advised

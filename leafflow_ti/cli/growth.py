@@ -13,6 +13,9 @@ from leafflow_ti.cli.progress import counted
 if TYPE_CHECKING:
     from leafflow_ti.surface_growth import GrowthSummary
 
+DISAGREEMENT = 2.0
+"""Root mean square of (growth_rate - area_rate) / standard error beyond which advice is given."""
+
 
 def growth(
     result: Annotated[Path, typer.Argument(metavar="OUT.zarr", help="Results of 'leafflow-ti run'.")],
@@ -55,6 +58,8 @@ def growth(
 
 def format_growth(summary: GrowthSummary) -> list[str]:
     """What was measured, a line for each map, and the agreement with the run's growth rate."""
+    import numpy as np
+
     from leafflow_ti.field import quantity
     from leafflow_ti.rates import per_hour
 
@@ -75,4 +80,9 @@ def format_growth(summary: GrowthSummary) -> list[str]:
             f"  (growth_rate - area_rate) / standard error: mean {a.mean:.2f}, standard deviation {a.std:.2f} "
             f"({a.pixels} pixels); 0 and 1 where both are right"
         )
+        if np.hypot(a.mean, a.std) > DISAGREEMENT:
+            lines.append(
+                "  the two disagree: growth that differs by direction (run with --deformation strain), light that "
+                "changes (--brightness), or windows that see two surfaces (smaller ones, --mask)"
+            )
     return lines

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from leafflow_ti.number_text import axis_labels, round_steps
 from leafflow_ti.report.facts import Series
 
-WIDTH, HEIGHT = 480, 250
-LEFT, RIGHT, TOP, BOTTOM = 58, 12, 14, 44
+WIDTH, HEIGHT = 480, 264
+LEFT, RIGHT, TOP, BOTTOM = 58, 12, 28, 44
 """Room around the curves, for the axes' numbers and names."""
 COLOURS = 8
 """Colours of curves in the style sheet, ``s0`` .. ``s7``."""
@@ -47,8 +47,8 @@ class _Axes:
         for x, text in zip(columns, axis_labels(columns), strict=True):
             parts.append(f'<text class="mid" x="{self.across(x)}" y="{base + 18}">{text}</text>')
         parts.append(f'<text class="mid name" x="{(LEFT + right) / 2}" y="{HEIGHT - 6}">{escape(x_label)}</text>')
-        middle = (TOP + base) / 2
-        parts.append(f'<text class="mid name" transform="translate(13 {middle}) rotate(-90)">{escape(y_label)}</text>')
+        # Above the axis: beside it, long numbers would run into the name.
+        parts.append(f'<text class="name" x="{LEFT - 7}" y="13">{escape(y_label)}</text>')
         return parts
 
 
