@@ -80,3 +80,12 @@ def leaf_maps(growth: float = 0.0, flow: tuple[float, float] = (0.0, 0.0)) -> Ca
         return found | {f"{n}_std": np.full(x.shape, errors.get(n, 1e-3)) for n in LEAF if not n.endswith("_std")}
 
     return maps
+
+
+def label_image(dtype: type = np.uint8) -> NDArray[Any]:
+    """Regions 1 (a square about the principal point) and 5 (a disc beside it)."""
+    image = np.zeros(SIZE[::-1], dtype)
+    image[45:76, 65:96] = 1
+    y, x = np.indices(image.shape)
+    image[np.hypot(x - 115, y - 60) <= 12] = 5
+    return image
