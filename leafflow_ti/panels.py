@@ -54,7 +54,7 @@ PAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "motion": ("Motion", ("velocity_x", "velocity_y", "velocity_z", "velocity")),
     "rotation": ("Rotation", ("rotation_x", "rotation_y", "rotation_z")),
     "flow": ("Optical flow", ("flow_x", "flow_y", "flow")),
-    "status": ("Status", ("status",)),
+    "status": ("Status and residual", ("status", "confidence")),
 }
 """Page -> its title and its panels: maps, or ``normals``, ``status``, ``velocity`` and ``flow`` (with arrows)."""
 OVERVIEW = (

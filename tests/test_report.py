@@ -20,6 +20,7 @@ import leafflow_ti
 from leafflow_ti.cli.main import main
 from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
 from leafflow_ti.mesh import surface_mesh
+from leafflow_ti.panels import panels_of
 from leafflow_ti.report import LIMIT, facts, write_report
 from leafflow_ti.report.charts import curves
 from leafflow_ti.report.facts import Series, spread_evenly
@@ -219,6 +220,12 @@ def test_growth_without_a_known_interval_is_per_frame(tmp_path: Path) -> None:
     text = "".join(parts_of(written(tmp_path, interval_s=None)).text)
     assert growth_in(text, "%/frame") == pytest.approx((0.2, 0.02 / (3 * 30 * 37) ** 0.5), rel=0.03)
     assert "%/h" not in text
+
+
+def test_residuals_are_shown_where_they_are_known() -> None:
+    """As the confidence, beside the status; results without that map have the status alone."""
+    pages = [panels_of(names)["status"] for names in (("depth", "confidence"), ("depth",))]
+    assert [[panel.key for panel in page] for page in pages] == [["status", "confidence"], ["status"]]
 
 
 def test_single_frame_has_no_slider(tmp_path: Path) -> None:

@@ -108,7 +108,8 @@ def spread_evenly(frames: Sequence[int], most: int) -> list[int]:
 def precision_of(store: ResultStore, frames: Sequence[int]) -> list[Precision]:
     """Medians of every map over these frames (indices along t), maps without any value left out."""
     found = []
-    for name in (n for n in store.names if not n.endswith("_std") and n not in WITHOUT_STD):
+    shown = (n for n in store.names if not n.endswith("_std") and (n not in WITHOUT_STD or n == "confidence"))
+    for name in shown:
         values = np.concatenate([store.read(name, t) for t in frames])
         if not np.isfinite(values).any():
             continue

@@ -163,7 +163,8 @@ def quality_section(store: ResultStore, facts: Facts, precision: Sequence[Precis
 <div><h3>Values and their standard errors</h3>
 <div class="scroll"><table><thead><tr><th>Map</th><th class="n">Median</th><th class="n">Standard error</th>
 <th>Unit</th><th class="n">Valid</th></tr></thead><tbody>{accuracy}</tbody></table></div>
-<p class="note">Medians over the pixels of {listed}.</p></div></div>"""
+<p class="note">Medians over the pixels of {listed}. Confidence, from 0 to 1, is the residual of a window against what
+noise explains, times how far its texture stands out.</p></div></div>"""
 
 
 def run_section(store: ResultStore) -> str:
