@@ -17,7 +17,7 @@ demo: $(BIN)/.installed
 	$(BIN)/leafflow-ti demo $(DEMO)
 
 test: $(BIN)/.installed
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(BIN)/.installed
 	$(BIN)/ruff check .

@@ -11,7 +11,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from leafflow_ti.api import estimate, plan_run, run
+    from leafflow_ti.api import estimate, plan_run
+    from leafflow_ti.arriving import follow
     from leafflow_ti.capture import Capture, Geometry, capture_from_array, open_capture
     from leafflow_ti.config import RunConfig, load_config
     from leafflow_ti.cumulative import track_growth
@@ -31,17 +32,17 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "estimate": "api", "plan_run": "api", "run": "api",
+    "estimate": "api", "plan_run": "api", "run": "runs",
     "Capture": "capture", "Geometry": "capture", "capture_from_array": "capture", "open_capture": "capture",
     "RunConfig": "config", "load_config": "config", "Field": "field", "ResultStore": "results",
     "check": "inspection", "Rig": "rig", "plan_rig": "rig",
     "release": "engines", "Tracks": "tracks", "track": "tracking", "track_growth": "cumulative",
     "leaf_coordinates": "leaf_axes", "export": "exporters", "RegionTable": "regions", "measure_regions": "regions",
-    "measure_growth": "surface_growth", "write_report": "report",
+    "measure_growth": "surface_growth", "write_report": "report", "follow": "arriving",
 }  # fmt: skip
 __all__ = [
     "Capture", "Field", "Geometry", "RegionTable", "ResultStore", "Rig", "RunConfig", "Tracks", "capture_from_array",
-    "check", "estimate", "export", "leaf_coordinates", "load_config", "measure_growth", "measure_regions",
+    "check", "estimate", "export", "follow", "leaf_coordinates", "load_config", "measure_growth", "measure_regions",
     "open_capture", "plan_rig", "plan_run", "release", "run", "track", "track_growth", "write_report",
 ]  # fmt: skip
 

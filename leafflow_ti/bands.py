@@ -1,8 +1,13 @@
-"""How high the bands of a run are, and the memory that one takes: arrays, frames read ahead, units not yet written."""
+"""How high the bands of a run are, and the memory that one takes: arrays, frames read ahead, units not yet written.
+
+The limit is one of the whole process. What that takes for itself is measured (``python -m perf memory``); the rest but
+for a reserve, of which the allocator's gaps are a part, is the arrays'.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +43,15 @@ INDEXED = 2**31 - 1
 """Numbers of a unit's arrays: kernels count them in 32 bits."""
 WRITE_BEHIND = 2
 """Finished units that may wait to be written, beside the one that is being written."""
+READERS = 16
+"""Most threads that read: one for each image of a frame. While a kernel runs none of them gets the interpreter, and
+between two kernels each gets it once, so that more threads than cores read faster."""
+PROCESS_BYTES = 224 << 20
+"""Of the interpreter, the packages, the engine and its kernels: 163 to 210 MiB measured, by model."""
+COMPILING_BYTES = 336 << 20
+"""The same while kernels are compiled: up to 320 MiB measured. Arrays come after that."""
+ARRAYS_SHARE = 0.875
+"""Of the rest, what arrays may take; the allocator's gaps and small things have taken up to a tenth."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +60,8 @@ class Demand:
 
     ``tile_cols``: of a tile where the images are shifted tile by tile, 0 elsewhere; ``image``: rows and columns of an
     image, where it is searched. ``margin``: output pixels that are computed around a unit. ``waiting``: frames that the
-    model takes later than the refinement.
+    model takes later than the refinement. ``reading``: bytes that one thread takes for the time of reading a window of
+    so many rows and columns, beside the window.
     """
 
     config: RunConfig
@@ -61,6 +76,7 @@ class Demand:
     tile_cols: int = 0
     image: tuple[int, int] = (0, 0)
     waiting: int = 0
+    reading: Callable[[int, int], int] = lambda rows, cols: 0
 
     def coefficients(self, rows: int) -> int:
         """Spline coefficients of the refinement for units of ``rows`` rows."""
@@ -99,7 +115,9 @@ class Demand:
             margin = gaussian_radius(config.filters.sigma_pre)
             total += prefilter_bytes(config.filters.sigma_pre, self.n_cameras, in_rows, in_cols, itemsize)
         # Grey values, and one byte that says whether each is finite.
-        block = self.n_cameras * (in_rows + 2 * margin) * (in_cols + 2 * margin) * (itemsize + 1)
+        window = in_rows + 2 * margin, in_cols + 2 * margin
+        block = self.n_cameras * window[0] * window[1] * (itemsize + 1)
+        total += (min(self.n_cameras, READERS) if ahead else 1) * self.reading(*window)
         unit = rows * self.cols * (4 * self.n_maps + 1)
         if self.tile_cols:
             maps = 2 * self.n_maps + MAPS_BESIDE  # standard errors, and what growth is made of
@@ -115,14 +133,18 @@ class Demand:
 
     def _refining(self, refine: Refinement, itemsize: int, gpu: bool) -> int:
         """Workspaces of the pixels that are refined at once."""
-        threads = self.config.plan.threads
-        count = usable_threads() if threads == "auto" else int(threads)
+        count = self.config.plan.threads_each(usable_threads())
         return Workspaces.of(refine, 1 if gpu else DENSE_LANES["f64"], (itemsize, 8), gpu, count).bytes
 
 
 def usable_memory(config: RunConfig) -> int:
-    """Bytes of the limit that arrays may take; the rest is the interpreter's, the engine's and the results'."""
-    return int(0.8 * config.plan.max_memory)
+    """Bytes of the limit that a worker's arrays may take."""
+    return max(0, int(ARRAYS_SHARE * (config.plan.memory_each - PROCESS_BYTES)))
+
+
+def least_limit(needed: int) -> int:
+    """The least limit [bytes] of a process under which arrays of ``needed`` bytes fit."""
+    return max(COMPILING_BYTES, PROCESS_BYTES + math.ceil(needed / ARRAYS_SHARE))
 
 
 def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int, int, int]:
@@ -131,6 +153,8 @@ def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int,
     Raises ConfigError when nothing fits.
     """
     plan, limit = demand.config.plan, usable_memory(demand.config)
+    if plan.memory_each < COMPILING_BYTES:
+        limit = 0
     addressed = INDEXED * (4 if demand.config.precision == "f32" else 8)
 
     def indexed(rows: int) -> bool:
@@ -156,7 +180,13 @@ def choose_bands(demand: Demand, rows: int, depths: Iterable[int]) -> tuple[int,
             f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB and {splines} spline coefficients; kernels take "
             f"{addressed / 2**20:.0f} MiB and {ADDRESSED} of these: lower plan.tile, or use a roi, a smaller window"
         )
+    least, shared = plan.memory_for_all(least_limit(needed)), f" in {plan.workers} workers" * (plan.workers > 1)
     raise ConfigError(
-        f"a unit of {chosen} rows needs {needed / 2**20:.0f} MiB, 80 % of plan.max_memory are "
-        f"{limit / 2**20:.0f} MiB: raise it, lower plan.tile, or use a stride, a roi, a smaller window"
+        f"plan.max_memory = {_mebibytes(plan.max_memory)} is too little: the program and a unit of {chosen} rows need "
+        f"{_mebibytes(least)}{shared}: raise it, or need less with a lower plan.tile, a stride, a roi, a smaller window"
     )
+
+
+def _mebibytes(n: int) -> str:
+    """As the option takes it, rounded up."""
+    return f"{-(-n // 2**20)}M"

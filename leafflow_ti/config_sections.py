@@ -45,6 +45,7 @@ Weighting = Literal["wls", "ls"]
 SIGMA_PER_SIZE = 19.0 / 65.0
 """Gaussian width relative to the window size in the dissertation's experiments (65 pixels, sigma 19)."""
 
+
 Auto = Literal["auto"]
 Preshift = Literal["auto", "uniform", "adaptive"]
 _Taps = Annotated[Literal["3x1x1", "3", "5", "7"], BeforeValidator(str)]
@@ -59,6 +60,9 @@ _AutoFrames = Annotated[tuple[int, int] | Auto, BeforeValidator(before_and_behin
 _AutoRange = Annotated[tuple[float, float] | Auto, BeforeValidator(increasing)]
 _Noise = Annotated[float | Auto, BeforeValidator(noise_or_auto)]
 _Width = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+PARENT_BYTES = 96 << 20
+"""Of the process that plans and starts workers, while they work: 70 MiB measured."""
 
 
 class Section(BaseModel):
@@ -190,11 +194,34 @@ class RefineSection(Section):
 
 
 class PlanSection(Section):
-    """Resources: image rows per tile, memory limit [bytes], threads."""
+    """Resources: image rows per tile, memory limit [bytes] of all processes together, threads of each of them, and
+    ``workers``, that is processes; 1: the work is done in this one. ``check_disk``: ask for the disk's room before a
+    run."""
 
     tile: _AutoCount = "auto"
     max_memory: Annotated[int, BeforeValidator(parse_memory)] = Field(default_factory=lambda: machine_memory() // 2)
     threads: _AutoCount = "auto"
+    check_disk: bool = True
+    workers: Annotated[int, BeforeValidator(lambda v: integer(v, 1))] = 1
+
+    @property
+    def memory_each(self) -> int:
+        """Bytes that one worker may take; several of them leave something to the process that they work for."""
+        return self.max_memory if self.workers == 1 else max(0, (self.max_memory - PARENT_BYTES) // self.workers)
+
+    def memory_for_all(self, each: int) -> int:
+        """The least limit under which each worker may take so many bytes."""
+        return each if self.workers == 1 else PARENT_BYTES + each * self.workers
+
+    @property
+    def limit_in_words(self) -> str:
+        """Of the memory, and for how many."""
+        shared = f" for {self.workers} processes" if self.workers > 1 else ""
+        return f"{self.max_memory / 2**20:.0f} MiB{shared}"
+
+    def threads_each(self, usable: int) -> int:
+        """CPU threads of one worker on a machine that has so many to use."""
+        return max(1, usable // self.workers) if self.threads == "auto" else int(self.threads)
 
 
 class OutputSection(Section):

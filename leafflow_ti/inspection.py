@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.capture import Capture, open_capture
+from leafflow_ti.capture import Capture, capture_doubts, open_capture
+from leafflow_ti.capture.plausibility import depth_doubts
 from leafflow_ti.errors import InputError
 from leafflow_ti.inspection_advice import advice
-from leafflow_ti.inspection_report import CameraCheck, Report
+from leafflow_ti.inspection_report import Advice, CameraCheck, Report
 from leafflow_ti.matching import Templates, choose_points
 from leafflow_ti.noise import white_noise
 from leafflow_ti.photometry import defects, saturated, texture_of
@@ -56,7 +57,10 @@ class _Check:
         self.image = lru_cache(KEPT_IMAGES)(self._image)
 
     def _image(self, t: int, row: int, col: int) -> NDArray[np.float32]:
-        return self.capture.read(t, row, col, 0, self.capture.height, 0, self.capture.width)
+        """Grey values, NaN where they are no numbers: infinite ones say no more."""
+        image = self.capture.read(t, row, col, 0, self.capture.height, 0, self.capture.width)
+        image[np.isinf(image)] = np.nan
+        return np.asarray(image, np.float32)
 
     def report(self) -> Report:
         """Everything, then what it means."""
@@ -90,7 +94,16 @@ class _Check:
             if coarse and capture.n_frames > 1 and coarse.known.any() else None,
             (),
         )  # fmt: skip
-        return replace(found, advice=advice(found, capture, places))
+        doubts = tuple(Advice("problem", text) for text in self._doubts(found))
+        return replace(found, advice=(*doubts, *advice(found, capture, places)))
+
+    def _doubts(self, found: Report) -> list[str]:
+        """What a run would warn of, and depths that can hardly be meant."""
+        doubts = list(capture_doubts(self.capture))
+        if found.disparity_px is not None:
+            middle = sum(found.disparity_px) / 2
+            doubts += depth_doubts(self.capture, (middle, 0.0) if self.capture.n_cols > 1 else (0.0, middle))
+        return doubts
 
     def _coarse(self) -> Coarse | None:
         """Disparities and motions of every pixel of the reference camera's middle frame; None: nothing to compare."""
@@ -167,10 +180,14 @@ class _Check:
         ]  # fmt: skip
 
     def _frame_gains(self) -> dict[int, float]:
-        """Mean grey values of some frames of the reference camera over that of the middle one."""
-        reference = self.capture.reference
-        means = {t: float(np.nanmean(self.image(t, *reference))) for t in {*self.frames, self.frame}}
-        return {t: means[t] / means[self.frame] for t in sorted(means)} if means[self.frame] else {}
+        """Mean grey values of some frames of the reference camera over that of the middle one; of those with any."""
+        reference, means = self.capture.reference, dict[int, float]()
+        for t in sorted({*self.frames, self.frame}):
+            image = self.image(t, *reference)
+            known = np.isfinite(image)
+            if known.any():
+                means[t] = float(np.mean(image, where=known))
+        return {t: mean / means[self.frame] for t, mean in means.items()} if means[self.frame] else {}
 
 
 def _range(values: NDArray[Any]) -> tuple[float, float]:

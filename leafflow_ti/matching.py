@@ -58,7 +58,9 @@ def choose_points(image: Floats, noise: float, allowed: Mask) -> NDArray[np.intp
     ``noise``: standard deviation of the image's; ``allowed`` [H, W]: where points may lie.
     """
     margin = HALF + 3
-    least = np.where(allowed & np.isfinite(image), structure(np.nan_to_num(image), HALF), 0.0)
+    finite = np.isfinite(image)
+    known = _box_sums((~finite).astype(np.float64), HALF + 1) == 0  # with the neighbours that gradients take
+    least = np.where(allowed & known, structure(np.where(finite, image, 0.0), HALF), 0.0)
     least[:margin], least[-margin:], least[:, :margin], least[:, -margin:] = 0.0, 0.0, 0.0, 0.0
     cell = max(CELL, int(np.ceil(np.sqrt(image.size / MOST_POINTS))))
     found = []
@@ -123,7 +125,7 @@ class Templates:
             x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
             values, sure = resample(lambda y0, y1, x0, x1: image[y0:y1, x0:x1], image.shape, y, x, np.float64)
             inside &= sure.all(axis=1)
-            residual = values - self._grey
+            residual = np.where(sure, values - self._grey, 0.0)  # a window with unknown pixels does not count
             step = np.einsum("nks,ns->nk", self._solve, residual)
             warp[:, :6] -= step[:, :6]
             change = np.abs(step[:, :2]).max(axis=1)

@@ -10,6 +10,8 @@ from leafflow_ti.config import RunConfig
 
 Array = NDArray[np.float64]
 
+DIGITS = 6
+"""Of an estimated level: sums differ in their last bits from one machine to another, results shall not."""
 LEAST_NOISE = 1e-6
 """Least noise of images that are not rounded, relative to their largest grey value."""
 _MASK = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
@@ -40,7 +42,7 @@ def noise_level(capture: Capture, config: RunConfig) -> float:
     noise = white_noise(image, capture.dtype.kind in "bui") if given == "auto" else float(given)
     if homomorphic and (image > 0).any():
         noise /= float(np.median(image[image > 0]))
-    return noise
+    return float(f"{noise:.{DIGITS}g}")
 
 
 def white_noise(image: NDArray[np.floating], rounded: bool) -> float:
@@ -52,7 +54,8 @@ def white_noise(image: NDArray[np.floating], rounded: bool) -> float:
     ``LEAST_NOISE`` of their largest value.
     """
     finite = np.isfinite(image)
-    largest = float(np.max(np.abs(image[finite]), initial=0.0))
+    # No copy of the image: large ones are what the memory of making a plan goes to.
+    largest = max(float(image.max(initial=0.0, where=finite)), -float(image.min(initial=0.0, where=finite)))
     least = 12**-0.5 if rounded else LEAST_NOISE * largest
     differences = _differences(_blocks(image))
     whole = np.isfinite(differences).all(axis=1)
@@ -82,7 +85,8 @@ def _differences(blocks: Array) -> Array:
         n = max(blocks.shape[1] - _MASK.size + 1, 0)
         total = np.zeros((len(blocks), n, blocks.shape[2]))
         for k, weight in enumerate(_MASK):
-            total += weight * blocks[:, k : k + n]
+            with np.errstate(invalid="ignore"):  # infinite values, of which no difference counts
+                total += weight * blocks[:, k : k + n]
         blocks = total.transpose(0, 2, 1)
     return np.abs(blocks.reshape(len(blocks), -1))
 

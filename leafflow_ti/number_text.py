@@ -62,3 +62,14 @@ def duration(seconds: float) -> str:
             rest = total % size // part
             return f"{total // size} {unit}" + (f" {rest:02d} {smaller}" if rest else "")
     return f"{total} s" if seconds >= 10 or not seconds else f"{seconds:.2g} s"
+
+
+def spans(numbers: list[int]) -> str:
+    """Increasing numbers in words: 3-5, 9."""
+    found: list[list[int]] = []
+    for number in numbers:
+        if found and number == found[-1][-1] + 1:
+            found[-1] = [found[-1][0], number]
+        else:
+            found.append([number])
+    return ", ".join("-".join(map(str, ends)) for ends in found)

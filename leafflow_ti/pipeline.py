@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from leafflow_ti.adaptive import Adaptive
 from leafflow_ti.aim import Aim
 from leafflow_ti.capture import Capture
+from leafflow_ti.memory import give_back
 from leafflow_ti.plan import Plan, Unit
 from leafflow_ti.range_engine import Sample
 from leafflow_ti.refinement import Place, refine_maps, refine_middle
@@ -47,6 +48,7 @@ class Pipeline(Units):
             self._one_pixel(None)
             if self.plan.adaptive:
                 warm_up(self.device)
+        give_back()
         return self.trace.seconds["compile"]
 
     def least_seconds(self) -> dict[str, float]:
@@ -93,23 +95,26 @@ class Pipeline(Units):
                 estimate(one_more())
         self.device.synchronize()
 
-    def run(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
-        """Compute every unit that is not ``done`` and hand over its maps [rows, columns] and status."""
+    def run(
+        self, deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None], wanted: Collection[int] | None = None
+    ) -> None:
+        """Compute the units ``wanted`` (None: all) and hand over the maps [rows, columns] and the status of each."""
+        wanted = range(self.plan.n_units) if wanted is None else wanted
         if self.plan.adaptive:
-            self._run_adaptive(done, deliver)
+            self._run_adaptive(wanted, deliver)
             return
         for band in range(self.plan.bands):
-            pending = [t for t in range(len(self.plan.frames)) if self.plan.unit(t, band).index not in done]
+            pending = [t for t in range(len(self.plan.frames)) if self.plan.unit(t, band).index in wanted]
             for first, last in _runs(pending):
                 with active(self.trace), contextlib.closing(self._sequence(band, first, last)) as units:
                     for unit, maps, status in units:
                         deliver(unit, maps, status)
 
-    def _run_adaptive(self, done: set[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
+    def _run_adaptive(self, wanted: Collection[int], deliver: Callable[[Unit, Maps, NDArray[np.uint8]], None]) -> None:
         """Frame by frame: the bands of a frame share what its search has found."""
         adaptive, bands = Adaptive(self), range(self.plan.bands)
         for t_index in range(len(self.plan.frames)):
-            pending = [b for b in bands if self.plan.unit(t_index, b).index not in done]
+            pending = [b for b in bands if self.plan.unit(t_index, b).index in wanted]
             if pending:
                 with active(self.trace):
                     for unit, maps, status in adaptive.units(t_index, pending):

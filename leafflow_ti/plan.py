@@ -236,7 +236,7 @@ class Plan:
         if self.refine:
             lines.append(self.refine.describe())
         pixels = len(self.frames) * len(self.y) * len(self.x)
-        limit = self.config.plan.max_memory
+        limit = self.config.plan.limit_in_words
         filters, known = self.config.filters, self.config.model.noise != "auto"
         unit = "of the grey value" if filters.prefilter == "homomorphic" else "grey values"
         if filters.prefilter != "none":
@@ -251,7 +251,7 @@ class Plan:
             f"{', '.join(self.names)}",
             f"units       {self.n_units}: {self.bands} bands of up to {self.band_rows} rows per frame",
             f"memory      {self.bytes / 2**20:.0f} MiB for one unit, {self.read_ahead} frames read ahead, "
-            f"{self.cache_bytes / 2**20:.0f} MiB of them decoded images; limit {limit / 2**20:.0f} MiB",
+            f"{self.cache_bytes / 2**20:.0f} MiB of them decoded images; limit {limit}",
             f"disk        at most {pixels * (4 * len(self.names) + 1) / 2**20:.0f} MiB",
         ]
         return "\n".join(lines)
@@ -335,7 +335,7 @@ def make_plan(capture: Capture, config: RunConfig) -> Plan:
     demand = Demand(
         config, problem, layout, ranges, refine, len(cameras[0]) * len(cameras[1]), len(plan.names), len(x), plan.margin
     )
-    demand = replace(demand, waiting=around[1] - problem.sampling.t.after)
+    demand = replace(demand, waiting=around[1] - problem.sampling.t.after, reading=capture.reading_bytes)
     if adaptive:
         demand = replace(
             demand, tile_cols=min(len(x), -(-TILE_PIXELS // stride)), image=(capture.height, capture.width)

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from leafflow_ti.api import create_store, start_device
 from leafflow_ti.background import Behind
 from leafflow_ti.bands import WRITE_BEHIND
 from leafflow_ti.capture import Capture
@@ -26,12 +25,14 @@ from leafflow_ti.plan import Plan, Unit, make_plan
 from leafflow_ti.profile_report import Prediction, Profile, StageCost
 from leafflow_ti.refine_work import count_refinement
 from leafflow_ti.results import ResultStore
+from leafflow_ti.run_store import create_store
 from leafflow_ti.runtime import Device
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.tensor import Band
 from leafflow_ti.stays import Maps
 from leafflow_ti.trace import BACKGROUND_STAGES, STAGES, Event, Trace, active, span
 from leafflow_ti.work import Rate, Work, count_work, rate
+from leafflow_ti.worker import start_device
 
 ALONE_FRAMES = 3
 """Frames read, and times a unit is written, to see what that costs by itself."""
@@ -176,10 +177,10 @@ def _share_of_solving(plan: Plan, capture: Capture, device: Device, band: int) -
     """
     trace = Trace(barrier=device.synchronize)
     pipeline = Pipeline(replace(plan, refine=None), capture, device, trace, apart=True)
-    others = set(range(plan.n_units)) - {plan.unit(0, band).index}
-    pipeline.run(others, lambda *_: None)
+    wanted = {plan.unit(0, band).index}
+    pipeline.run(lambda *_: None, wanted)
     before = trace.seconds
-    pipeline.run(others, lambda *_: None)
+    pipeline.run(lambda *_: None, wanted)
     solve, fit = (trace.seconds[stage] - before[stage] for stage in ("solve", "fit"))
     return solve / (solve + fit)
 
@@ -230,7 +231,7 @@ def _run_units(pipeline: Pipeline, wanted: set[int]) -> float:
                 _write(store, result)
 
         with active(pipeline.trace), Behind(write, WRITE_BEHIND) as writer:
-            pipeline.run(set(range(plan.n_units)) - wanted, lambda *result: writer.put(result))
+            pipeline.run(lambda *result: writer.put(result), wanted)
         return statistics.median(_seconds_of_writing(store, last[0]))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Self
 
@@ -31,6 +32,12 @@ class Progress:
         return None if rate is None else (self.pixels_total - self.pixels_done) / rate
 
 
+def add_seconds(total: dict[str, float], more: Mapping[str, float]) -> None:
+    """Add seconds per stage to those that are known."""
+    for stage, seconds in more.items():
+        total[stage] = total.get(stage, 0.0) + seconds
+
+
 @dataclass(frozen=True, slots=True)
 class Timings:
     """What units have cost: ``seconds`` on the clock and per stage, all runs that worked on a results store together.
@@ -55,7 +62,8 @@ class Timings:
         return self.pixels / self.seconds if self.seconds > 0 else 0.0
 
     def __add__(self, later: Timings) -> Timings:
-        stages = {s: self.stages.get(s, 0.0) + later.stages.get(s, 0.0) for s in (*self.stages, *later.stages)}
+        stages = dict(self.stages)
+        add_seconds(stages, later.stages)
         return Timings(
             self.seconds + later.seconds, stages, self.units + later.units, self.pixels + later.pixels,
             self.frames + later.frames, self.runs + later.runs, later.device or self.device,

@@ -7,7 +7,7 @@ Pictures are in pixel coordinates of the reference image (x right, y down) with 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from leafflow_ti.field import Field
 from leafflow_ti.panels import Panel, arrows_of, extent, panels_of
 from leafflow_ti.results import ResultStore
 from leafflow_ti.status import Status
+from leafflow_ti.whole import appearing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 _DPI = 120
+_MOST_PIXELS = 1000
+"""Output pixels along a side of an image: of a picture of some 370 more cannot be seen."""
 _IMAGE_INCHES = 3.1
 _LEFT_INCHES, _RIGHT_INCHES, _ABOVE_INCHES, _BELOW_INCHES = 0.65, 1.35, 0.35, 0.5
 """Width of an image, and the room for labels, colour bar and title around it."""
@@ -42,19 +45,31 @@ def write_quicklooks(store: ResultStore, t_index: int, folder: str | Path) -> li
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtra("matplotlib", "plot", "writing quick looks") from None
-    field, folder = store.field(t_index), Path(folder)
+    pages, folder = panels_of(store.names, store.interval_s), Path(folder)
+    field = _thinned(store, t_index, {name for panels in pages.values() for panel in panels for name in panel.needs})
     written = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, panels in panels_of(store.names, store.interval_s).items():
-            figure = Figure()
-            _lay_out(figure, field, panels, f"{store.path.name} · frame {field.frame} · {name}")
-            path = folder / f"{name}.png"
-            figure.savefig(path, dpi=_DPI, facecolor="white", metadata={"Software": None})
-            written.append(path)
-    except OSError as error:
-        raise RunError(f"{folder}: quick looks cannot be written ({error.strerror}): see --no-quicklook") from error
+    for name, panels in pages.items():
+        figure = Figure()
+        _lay_out(figure, field, panels, f"{store.path.name} · frame {field.frame} · {name}")
+        path = folder / f"{name}.png"
+        try:
+            with appearing(path) as scratch:
+                figure.savefig(scratch, dpi=_DPI, facecolor="white", metadata={"Software": None})
+        except RunError as error:
+            raise RunError(f"quick looks cannot be written: {error}; --no-quicklook goes without") from error
+        written.append(path)
     return written
+
+
+def _thinned(store: ResultStore, t_index: int, names: Collection[str]) -> Field:
+    """Some maps of one frame with no more pixels than pictures show: all maps of a large frame are much memory."""
+    thin = -(-max(store.y.size, store.x.size) // _MOST_PIXELS)
+
+    def read(name: str) -> NDArray[Any]:
+        return store.read(name, t_index)[::thin, ::thin].copy()
+
+    maps = {name: read(name) for name in store.names if name in names}
+    return Field(maps, read("status"), store.y[::thin], store.x[::thin], store.frames[t_index], store.attrs)
 
 
 def _lay_out(figure: Figure, field: Field, panels: Sequence[Panel], title: str) -> None:

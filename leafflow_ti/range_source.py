@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.capture import Capture
+from leafflow_ti.capture.files import Reach
 from leafflow_ti.capture.images import probe, read_gray
 from leafflow_ti.capture.pattern import Pattern
 from leafflow_ti.config_sections import WindowSection
@@ -153,7 +154,9 @@ def open_range(path: str, capture: Capture, frames: range) -> GivenRange:
         raise ConfigError(f"range_flow.depth = {path!r}: {error}") from None
     if set(pattern.fields) - {"t"}:
         raise ConfigError(f"range_flow.depth = {path!r}: a range map has the field {{t}} alone")
-    found = [(fields.get("t", 0), file) for fields, file in pattern.discover(Path()) if file.is_file()]
+    found = [
+        (fields.get("t", 0), file) for fields, file in pattern.discover(Reach(Path(), outside=True)) if file.is_file()
+    ]
     if not found:
         raise InputError(
             f"{path}: no such range maps: give a results store, a stack, or a pattern such as z_{{t:03d}}.tif"

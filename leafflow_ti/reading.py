@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from leafflow_ti.aim import Aim
 from leafflow_ti.background import prepared
+from leafflow_ti.bands import READERS
 from leafflow_ti.capture import Capture
 from leafflow_ti.capture.images import read_gray
 from leafflow_ti.capture.measured import LEAST_FRACTION, REACH
@@ -21,9 +22,6 @@ from leafflow_ti.plan import Plan
 from leafflow_ti.trace import span
 
 Mask = NDArray[np.bool_]
-MAX_THREADS = 16
-"""One for each image of a frame, up to these: while a kernel runs none of them gets the interpreter, and between two
-kernels each gets it once, so that more threads than cores read faster."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Reader:
 
     def __init__(self, plan: Plan, capture: Capture, dtype: type[np.floating[Any]]):
         self.plan, self.capture, self.dtype = plan, capture, dtype
-        self.threads = min(len(plan.cameras[0]) * len(plan.cameras[1]), MAX_THREADS)
+        self.threads = min(len(plan.cameras[0]) * len(plan.cameras[1]), READERS)
         self.mask = _read_mask(plan.config.output.mask, capture)
 
     def blocks(

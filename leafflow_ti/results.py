@@ -8,10 +8,10 @@ list the folders of groups, where a foreign entry would be reported, but never t
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -20,12 +20,35 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import zarr
 from numpy.typing import ArrayLike, NDArray
-from zarr.errors import NodeNotFoundError
 
-from leafflow_ti.chunk_files import COMPRESSOR, flush, write_chunks, writing
+from leafflow_ti import unit_marks
+from leafflow_ti.chunk_files import (
+    COMPRESSOR,
+    flush,
+    flush_tree,
+    make_folders,
+    own_token,
+    reading,
+    remove_scratch,
+    replace_file,
+    write_chunks,
+    writing,
+)
 from leafflow_ti.display import results_html
 from leafflow_ti.errors import InputError, MissingExtra, RunError, UsageError
-from leafflow_ti.field import QUANTITIES, Field, empty_map, map_attributes, quantity, with_std
+from leafflow_ti.field import QUANTITIES, Field, quantity, with_std
+from leafflow_ti.locks import alone, changing_attributes
+from leafflow_ti.placing import put_in_place, remove_abandoned, whole_arrays
+from leafflow_ti.store_arrays import (
+    COORDINATES,
+    MEASURED,
+    METADATA,
+    arrays_of,
+    coordinate,
+    create_map,
+    is_ours,
+    open_group,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -33,16 +56,10 @@ if TYPE_CHECKING:
 FORMAT = 1
 """Version of the layout, in the attribute ``leafflow_ti_format`` by which a store is recognised."""
 
-_UNFINISHED = "unfinished_maps"
+UNFINISHED = "unfinished_maps"
 """Attribute: maps that are being added."""
-_METADATA = "zarr.json"
-"""The group's metadata file, attributes included (Zarr v3)."""
-
-COORDINATES: dict[str, dict[str, Any]] = {
-    "t": {"long_name": "index of the reference frame", "units": "frame"},
-    "y": {"long_name": "row in the reference image, downwards", "units": "px"},
-    "x": {"long_name": "column in the reference image, to the right", "units": "px"},
-}
+FRAMES_PER_CHUNK = 1024
+"""Of the coordinate t: so that it can grow without its chunks being cut anew."""
 
 TIME: dict[str, Any] = {"long_name": "time of the results", "units": "s"}
 
@@ -93,29 +110,37 @@ class ResultStore:
         shape = tuple(values.size for values in coordinates.values())
         if chunk[0] != 1 or not 1 <= chunk[1] <= shape[1] or chunk[2] != shape[2]:
             raise ValueError(f"chunk {chunk} must be (1, 1..{shape[1]}, {shape[2]}): whole rows of one frame")
-        _check_replaceable(path, overwrite)
+        check_replaceable(path, overwrite)
+        remove_abandoned(path)
         with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            scratch = path.with_name(f".{path.name}.{os.getpid()}")
+            for parent in make_folders(path.parent):
+                flush(parent)
+            scratch = path.with_name(f".{path.name}.{own_token()}")
+            (scratch / "status").mkdir(parents=True)
             try:
-                group = zarr.create_group(scratch, zarr_format=3)
-                group.update_attributes({"Conventions": "CF-1.11", **attrs, "leafflow_ti_format": FORMAT})
-                for axis, values in coordinates.items():
-                    attributes = dict(COORDINATES[axis])
-                    if axis == "t" and interval_s is not None:
-                        attributes["interval_s"] = float(interval_s)
-                    if axis == "t" and time_offset:
-                        attributes["time_offset"] = float(time_offset)
-                    group.create_array(axis, data=values, dimension_names=[axis], attributes=attributes)
-                if times_s is not None:
-                    times = np.asarray(times_s, np.float64)
-                    group.create_array("time", data=times, dimension_names=["t"], attributes=TIME)
-                for name in (*names, "status"):
-                    _create_map(group, name, f"{name}_std" in names, shape, chunk)
-                (scratch / "status" / ".done").mkdir()
-                if path.exists():
-                    shutil.rmtree(path)
-                scratch.rename(path)
+                with alone(scratch):
+                    group = zarr.create_group(scratch, zarr_format=3)
+                    own = {MEASURED: list(names), "leafflow_ti_format": FORMAT}
+                    group.update_attributes({"Conventions": "CF-1.11", **attrs, **own})
+                    for axis, values in coordinates.items():
+                        attributes = dict(COORDINATES[axis])
+                        if axis == "t" and interval_s is not None:
+                            attributes["interval_s"] = float(interval_s)
+                        if axis == "t" and time_offset:
+                            attributes["time_offset"] = float(time_offset)
+                        group.create_array(
+                            axis, data=values, chunks=(FRAMES_PER_CHUNK if axis == "t" else values.size,),
+                            dimension_names=[axis], attributes=attributes, compressors=COMPRESSOR, filters=None,
+                        )  # fmt: skip
+                    if times_s is not None:
+                        times = np.asarray(times_s, np.float64)
+                        group.create_array("time", data=times, dimension_names=["t"], attributes=TIME)
+                    for name in (*names, "status"):
+                        create_map(group, name, f"{name}_std" in names, shape, chunk)
+                    (scratch / unit_marks.FOLDER).mkdir()
+                    flush_tree(scratch)
+                    if not put_in_place(scratch, path, overwrite):
+                        check_replaceable(path, overwrite=False)
             except BaseException:
                 shutil.rmtree(scratch, ignore_errors=True)
                 raise
@@ -125,7 +150,7 @@ class ResultStore:
     def open(cls, path: str | Path) -> Self:
         """An existing store, to read or to go on writing; InputError when ``path`` is none."""
         path = Path(path)
-        group = _open_group(path)
+        group = open_group(path)
         if group is None:
             raise InputError(f"{path}: no results store; give the OUT.zarr of a 'leafflow-ti run'")
         found = group.attrs["leafflow_ti_format"]
@@ -133,17 +158,19 @@ class ResultStore:
             raise InputError(
                 f"{path}: written in format {found}, this version reads {FORMAT}: run again with --overwrite"
             )
-        arrays = dict(group.arrays())
-        t, y, x = (np.asarray(arrays[axis][...], np.int64) for axis in ("t", "y", "x"))
-        unfinished: Any = group.attrs.get(_UNFINISHED, [])
+        with reading(path):
+            arrays = arrays_of(path, group)
+            t, y, x = (coordinate(arrays, axis) for axis in COORDINATES)
+            unit_rows = arrays["status"].chunks[1]
+        unfinished: Any = group.attrs.get(UNFINISHED, [])
         known = [n for n in with_std(QUANTITIES) if n in arrays]
         names, left = (tuple(n for n in known if (n in unfinished) == out) for out in (False, True))
-        return cls(path, tuple(t.tolist()), y, x, names, left, arrays["status"].chunks[1], group, arrays)
+        return cls(path, tuple(t.tolist()), y, x, names, left, unit_rows, group, arrays)
 
     @property
     def attrs(self) -> dict[str, Any]:
         """Attributes of the store as they are now: resolved configuration, versions, device, fingerprints, timings."""
-        found: dict[str, Any] = json.loads((self.path / _METADATA).read_text(encoding="utf-8"))["attributes"]
+        found: dict[str, Any] = json.loads((self.path / METADATA).read_text(encoding="utf-8"))["attributes"]
         return found
 
     def update_attrs(self, attrs: Mapping[str, Any]) -> None:
@@ -152,14 +179,16 @@ class ResultStore:
 
         Raises RunError when the store cannot be written.
         """
-        with writing(self.path):
-            metadata = json.loads((self.path / _METADATA).read_text(encoding="utf-8"))
-            found = metadata["attributes"] | dict(attrs)
+        self.change_attrs(lambda found: found | dict(attrs))
+
+    def change_attrs(self, change: Callable[[dict[str, Any]], Mapping[str, Any]]) -> None:
+        """The same with attributes that follow from what they are now; nobody else changes them meanwhile."""
+        with writing(self.path), changing_attributes(self.path):
+            metadata = json.loads((self.path / METADATA).read_text(encoding="utf-8"))
+            found = change(metadata["attributes"])
             metadata["attributes"] = {name: value for name, value in found.items() if value is not None}
-            scratch = self.path / "status" / ".done" / f".{_METADATA}"
-            scratch.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
-            flush(scratch)
-            scratch.replace(self.path / _METADATA)
+            text = json.dumps(metadata, indent=2)
+            replace_file(self.path / METADATA, text.encode(), self.path / unit_marks.FOLDER)
 
     @property
     def interval_s(self) -> float | None:
@@ -212,21 +241,32 @@ class ResultStore:
         wrong = [name for name, values in arrays.items() if values.shape != shape]
         if wrong:
             raise ValueError(f"unit {unit} needs the shape {shape}; {wrong[0]} has {arrays[wrong[0]].shape}")
-        write_chunks(self.path, (t_index, band), self._arrays, arrays)
+        written = write_chunks(self.path, (t_index, band), self._arrays, arrays)
         with writing(self.path):
-            self._mark(unit)
+            unit_marks.mark(self.path, unit, written)
 
-    def _mark(self, unit: int) -> None:
-        folder = self.path / "status" / ".done"
-        scratch = folder / f".{unit}.{os.getpid()}"
-        scratch.touch()
-        flush(scratch)
-        scratch.replace(folder / str(unit))
-        flush(folder)
+    def alone(self) -> contextlib.AbstractContextManager[None]:
+        """Nobody else writes this store while the block runs; RunError when somebody does."""
+        return alone(self.path)
+
+    def remove_scratch(self, units: Collection[int]) -> None:
+        """Remove what killed processes have left of units, and of the attributes; nobody else may be writing these
+        units."""
+        with writing(self.path):
+            unit_marks.remove_scratch(self.path, units)
+            with changing_attributes(self.path):  # so that nobody is writing them
+                for left in (self.path / unit_marks.FOLDER).glob(f".{METADATA}.*"):
+                    left.unlink(missing_ok=True)
+            for unit in units:
+                remove_scratch(self.path, divmod(unit, self.bands), self._arrays)
 
     def done(self) -> set[int]:
         """Units whose marker is written."""
-        return {int(entry.name) for entry in (self.path / "status" / ".done").iterdir() if entry.name.isdecimal()}
+        return {unit for unit in unit_marks.marked(self.path) if unit < self.n_units}
+
+    def is_done(self, unit: int) -> bool:
+        """Whether the marker of a unit is written."""
+        return (self.path / "status" / ".done" / str(unit)).exists()
 
     def read(self, name: str, t_index: int | None = None) -> NDArray[Any]:
         """A map or ``"status"``: ``[t, y, x]``, or ``[y, x]`` of the frame with index ``t_index`` along t.
@@ -235,7 +275,13 @@ class ResultStore:
         """
         if name not in (*self.names, "status"):
             raise InputError(f"{self.path}: has no map {name!r}; it has: {', '.join(self.names)}")
-        return np.asarray(self._arrays[name][... if t_index is None else t_index])
+        with reading(self.path, f"'leafflow-ti info {self.path} --verify' says which units are"):
+            array = self._arrays[name]
+            return np.asarray(array[: len(self.frames)] if t_index is None else array[t_index])
+
+    def maps(self) -> list[tuple[str, zarr.Array[Any]]]:
+        """The arrays ``[t, y, x]``, ``status`` included, by name."""
+        return [(name, self._arrays[name]) for name in (*self.names, "status")]
 
     def field(self, t_index: int) -> Field:
         """All maps of the frame with index ``t_index`` along t."""
@@ -277,15 +323,16 @@ class ResultStore:
         """
         self._check_whole()
         array = self._arrays["status"]
-        self.update_attrs({_UNFINISHED: list(names)})
-        with writing(self.path):
+        self.update_attrs({UNFINISHED: list(names)})
+        with writing(self.path), whole_arrays(self.path, names) as scratch:
+            group = zarr.create_group(scratch, zarr_format=3)
             for name in names:
-                _create_map(self._group, name, f"{name}_std" in names, array.shape, array.chunks)
+                create_map(group, name, f"{name}_std" in names, array.shape, array.chunks)
         return ResultStore.open(self.path)
 
     def finish_maps(self, attrs: Mapping[str, Any]) -> ResultStore:
         """The store with the added maps among its ``names``; ``attrs`` say how they were made."""
-        self.update_attrs({**attrs, _UNFINISHED: None})
+        self.update_attrs({**attrs, UNFINISHED: None})
         return ResultStore.open(self.path)
 
     @property
@@ -326,35 +373,11 @@ class ResultStore:
         self.update_attrs(attrs)
 
 
-def _create_map(group: zarr.Group, name: str, has_std: bool, shape: tuple[int, ...], chunk: tuple[int, ...]) -> None:
-    attributes = map_attributes(name) | ({"ancillary_variables": f"{name}_std status"} if has_std else {})
-    group.create_array(
-        name,
-        shape=shape,
-        chunks=chunk,
-        dtype=empty_map(name, ()).dtype,
-        fill_value=empty_map(name, ()).item(),
-        dimension_names=list(COORDINATES),
-        attributes=attributes,
-        compressors=COMPRESSOR,
-        filters=None,
-        overwrite=True,
-    )
-
-
-def _open_group(path: Path) -> zarr.Group | None:
-    """The group of a results store; None for anything else."""
-    try:
-        group = zarr.open_group(path, mode="r+", zarr_format=3)
-    except (NodeNotFoundError, OSError, ValueError):
-        return None
-    return group if "leafflow_ti_format" in group.attrs else None
-
-
-def _check_replaceable(path: Path, overwrite: bool) -> None:
+def check_replaceable(path: Path, overwrite: bool) -> None:
+    """Raise UsageError where a new store may not take this place."""
     if not path.exists():
         return
     if not overwrite:
         raise UsageError(f"{path} exists: give --overwrite to replace it, --resume to continue it, or another name")
-    if _open_group(path) is None:
+    if not is_ours(path) and open_group(path) is None:
         raise UsageError(f"{path} exists and is no results store, so --overwrite leaves it alone: give another name")

@@ -6,21 +6,23 @@ initialised the engine keeps its settings: they are adopted, never replaced.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import io
 import os
-import tempfile
 import threading
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import platformdirs
 from numpy.typing import NDArray
 
+from leafflow_ti import kernel_cache
 from leafflow_ti.errors import DeviceError
+from leafflow_ti.memory import share_one_arena
 
 if TYPE_CHECKING:
     from leafflow_ti.kernels.spec import KernelSpec
@@ -144,45 +146,68 @@ def _aligned(size: int, dtype: Any) -> NDArray[Any]:
     return raw[first : first + size * itemsize].view(dtype)
 
 
-def cache_folder() -> Path:
-    """A writable folder for compiled kernels: the user's cache, else a temporary one."""
-    wanted = os.environ.get("LEAFFLOW_TI_CACHE")
-    folder = Path(wanted) if wanted else Path(platformdirs.user_cache_dir("leafflow-ti", False)) / "kernels"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:
-        return Path(tempfile.mkdtemp(prefix="leafflow-ti-kernels-"))
-
-
 def _running() -> str | None:
     """Arch of an engine that is already initialised."""
-    from leafflow_ti.kernels.engine import ti
+    from leafflow_ti.kernels.engine import running, ti
 
-    if ti.lang.impl.get_runtime().prog is None:
+    if not running():
         return None
     name = str(ti.lang.impl.current_cfg().arch).rsplit(".", 1)[-1]
     return "cpu" if name in ("x64", "arm64") else name
 
 
-def _initialise(arch: str, threads: int) -> bool:
+def _initialise(arch: str, threads: int, cache: Path | None) -> bool:
     from leafflow_ti.kernels.engine import ti
 
+    settings = {"offline_cache": cache is not None, "cpu_max_num_threads": threads, "log_level": ti.ERROR}
+    if cache is not None:
+        settings["offline_cache_file_path"] = str(cache)
     # The engine announces its arch on standard output, which belongs to the program's results.
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            ti.init(
-                arch=getattr(ti, arch),
-                enable_fallback=False,
-                offline_cache=True,
-                offline_cache_file_path=str(cache_folder()),
-                cpu_max_num_threads=threads,
-                log_level=ti.ERROR,
-            )
-    except (RuntimeError, OSError):
-        return False
+    with contextlib.redirect_stdout(io.StringIO()), _hidden(*settings, "arch"), _existing_folder():
+        try:
+            ti.init(arch=getattr(ti, arch), enable_fallback=False, **settings)
+        except (RuntimeError, OSError):
+            return False
+    if cache is not None:
+        atexit.register(_keep_kernels, cache)
+    ti.lang.impl.get_runtime().materialize()  # only this thread may; afterwards all may launch kernels
     return True
+
+
+def _keep_kernels(cache: Path) -> None:
+    """At the end of the process: the engine writes what it has compiled when it is reset."""
+    from leafflow_ti.kernels.engine import forked, ti
+
+    if not forked():
+        kernel_cache.write(cache, ti.reset)
+
+
+@contextlib.contextmanager
+def _hidden(*settings: str) -> Iterator[None]:
+    """Without the engine's own variables for these settings: TI_ARCH would overrule the device that is asked for."""
+    hidden = {name: os.environ.pop(name) for name in (f"TI_{s.upper()}" for s in settings) if name in os.environ}
+    try:
+        yield
+    finally:
+        os.environ.update(hidden)
+
+
+@contextlib.contextmanager
+def _existing_folder() -> Iterator[None]:
+    """The engine asks for the current folder when it starts, which may have been removed."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        removed = os.open(".", os.O_RDONLY)
+    else:
+        yield
+        return
+    os.chdir("/")
+    try:
+        yield
+    finally:
+        os.fchdir(removed)
+        os.close(removed)
 
 
 def usable_threads() -> int:
@@ -205,25 +230,54 @@ def start(arch: str = "auto", precision: str = "f32", threads: int | None = None
         arch = os.environ.get("LEAFFLOW_TI_ARCH", "auto")
     if arch != "auto" and arch not in ARCHES:
         raise DeviceError(f"arch '{arch}' does not exist; choose auto, {', '.join(ARCHES)}")
+    from leafflow_ti.kernels.engine import check_not_forked
+
+    check_not_forked()
     n_threads = threads or usable_threads()
     with _lock:
         running = _running()
         if running is None:
-            candidates = ARCHES if arch == "auto" else (arch,)
-            for candidate in candidates:
-                if arch == "auto" and candidate == "vulkan" and _vulkan_is_software():
-                    continue
-                if _initialise(candidate, n_threads):
-                    running = candidate
-                    break
-        if running is None:
-            raise DeviceError(f"device '{arch}' could not be started; use --arch cpu or --arch auto")
-        if arch not in ("auto", running):
-            raise DeviceError(f"device '{arch}' was asked for, but this process already computes on '{running}'")
+            share_one_arena()
+            running = _started(ARCHES if arch == "auto" else (arch,), n_threads, choosing=arch == "auto")
+        else:
+            n_threads = min(n_threads, _adopt())
+    if running is None:
+        raise DeviceError(f"device '{arch}' could not be started; use --arch cpu or --arch auto")
+    if arch not in ("auto", running):
+        raise DeviceError(f"device '{arch}' was asked for, but this process already computes on '{running}'")
     has_double = running in ("cpu", "cuda", "vulkan")
     if precision == "f64" and not has_double:
         raise DeviceError(f"precision f64 does not exist on '{running}'; use f32 or --arch cpu")
     return Device(running, n_threads, precision, "f64" if has_double else "f32")
+
+
+def _started(candidates: Sequence[str], threads: int, choosing: bool) -> str | None:
+    """The first arch that starts; while ``choosing``, a software Vulkan driver counts as none."""
+    cache = kernel_cache.cache_folder()
+    if cache is not None:
+        kernel_cache.remove_stale_lock(cache)
+        kernel_cache.remove_damaged(cache)
+    for candidate in candidates:
+        if choosing and candidate == "vulkan" and _vulkan_is_software():
+            continue
+        if _initialise(candidate, threads, cache):
+            return candidate
+    return None
+
+
+def _adopt() -> int:
+    """Threads of the engine that runs. Raises DeviceError where a host has initialised
+    it in another thread, and not used it yet."""
+    from leafflow_ti.kernels.engine import ti
+
+    try:
+        ti.lang.impl.get_runtime().materialize()
+    except RuntimeError as error:
+        raise DeviceError(
+            f"this process's engine takes no kernels ({' '.join(str(error).split())}): let the thread that has "
+            "initialised it launch the first one"
+        ) from None
+    return int(ti.lang.impl.current_cfg().cpu_max_num_threads)
 
 
 def _vulkan_is_software() -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Protocol
 
@@ -102,7 +103,7 @@ class AxisSampling:
         """Of so many samples before and behind the reference sample: [before + 1 + after], in nominal steps."""
         return np.asarray(np.arange(-before, after + 1) - self.halfway, np.float64)
 
-    @property
+    @cached_property
     def offsets(self) -> Array:
         """Where the filtered samples of the window lie, from its centre, shape (size,)."""
         return np.asarray(np.arange(self.size) - self.size // 2, np.float64)
@@ -113,9 +114,13 @@ class AxisSampling:
             return np.ones(1)
         return self.filters.kernel(differentiate)
 
+    @cached_property
+    def _weights(self) -> Array:
+        return np.array(self.weights)
+
     def window(self, power: int) -> Array:
         """Weights times the offset to ``power``: ``w(Δ) Δ^power``, shape (size,)."""
-        return np.asarray(np.array(self.weights) * self.offsets**power)
+        return np.asarray(self._weights * self.offsets**power)
 
     def moment(self, power: int) -> float:
         """``Σ w(Δ) Δ^power``."""

@@ -87,21 +87,22 @@ def measure_growth(
     ``progress(done, frames)`` is called after every frame. Maps of an earlier call are replaced.
 
     Raises InputError for a store without motion in space or its correlations, UsageError for a window or an average
-    that does not fit, RunError for a run that is not finished.
+    that does not fit, RunError for a run that is not finished, or a store that somebody else writes.
     """
     store = store if isinstance(store, ResultStore) else ResultStore.open(store)
     noise = _correlation(store)
     gauge = _gauge(store, noise, strain_window)
     _check_average(average, len(store.frames))
-    store = store.add_maps(with_std(SURFACE_NAMES))
     summary = _Summary()
-    for t_index, (strain, rate, std) in enumerate(_averaged(store, gauge, noise, average)):
-        maps = strain.maps()
-        store.write_maps(t_index, {name: values.astype(np.float32) for name, values in maps.items()})
-        summary.add(maps, rate, std)
-        if progress:
-            progress(t_index + 1, len(store.frames))
-    store.finish_maps({ATTRIBUTE: {"strain_window_px": gauge.side, "average_frames": average}})
+    with store.alone():
+        store = store.add_maps(with_std(SURFACE_NAMES))
+        for t_index, (strain, rate, std) in enumerate(_averaged(store, gauge, noise, average)):
+            maps = strain.maps()
+            store.write_maps(t_index, {name: values.astype(np.float32) for name, values in maps.items()})
+            summary.add(maps, rate, std)
+            if progress:
+                progress(t_index + 1, len(store.frames))
+        store.finish_maps({ATTRIBUTE: {"strain_window_px": gauge.side, "average_frames": average}})
     found = summary.maps(), summary.agreement()
     return GrowthSummary(str(store.path), gauge.side, average, len(store.frames), store.interval_s, *found)
 

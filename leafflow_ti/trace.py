@@ -12,6 +12,7 @@ import json
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
@@ -62,7 +63,7 @@ class _Thread:
     """What one thread has spent: ns per stage, and of each open span the ns of the spans inside it."""
 
     number: int
-    name: str
+    thread: threading.Thread
     ns: dict[str, int] = field(default_factory=dict)
     inner: list[int] = field(default_factory=list)
 
@@ -79,6 +80,8 @@ class Trace:
         self.barrier = barrier
         self._local = threading.local()
         self._threads: list[_Thread] = []
+        self._begun = 0
+        self._ended: Counter[str] = Counter()
         self._lock = threading.Lock()
 
     def span(self, stage: str, label: str = "") -> AbstractContextManager[None]:
@@ -89,8 +92,7 @@ class Trace:
     def seconds(self) -> dict[str, float]:
         """Seconds per stage so far, all threads together, in the order of ``STAGES``; open spans do not count yet."""
         with self._lock:
-            threads = list(self._threads)
-        total = {stage: sum(thread.ns.get(stage, 0) for thread in threads) for stage in STAGES}
+            total = {s: self._ended[s] + sum(thread.ns.get(s, 0) for thread in self._threads) for s in STAGES}
         return {stage: ns / 1e9 for stage, ns in total.items() if ns}
 
     def of_thread(self) -> _Thread:
@@ -98,10 +100,23 @@ class Trace:
         found: _Thread | None = getattr(self._local, "record", None)
         if found is None:
             with self._lock:
-                found = _Thread(len(self._threads) + 1, threading.current_thread().name)
+                if self.events is None:
+                    self._add_up_ended()
+                self._begun += 1
+                found = _Thread(self._begun, threading.current_thread())
                 self._threads.append(found)
             self._local.record = found
         return found
+
+    def _add_up_ended(self) -> None:
+        """Keep the sums alone of threads that have ended: a long run reads with some new ones for every frame."""
+        alive = []
+        for record in self._threads:
+            if record.thread.is_alive():
+                alive.append(record)
+            else:
+                self._ended.update(record.ns)
+        self._threads = alive
 
     def write(self, path: Path) -> None:
         """Write the events in the JSON Trace Event Format, which Perfetto and Chrome's about:tracing open.
@@ -113,7 +128,7 @@ class Trace:
             raise ValueError("this trace keeps no events")
         process = os.getpid()
         named: list[dict[str, Any]] = [_name("process_name", process, 0, "leafflow-ti")]
-        named += [_name("thread_name", process, t.number, t.name) for t in self._threads]
+        named += [_name("thread_name", process, t.number, t.thread.name) for t in self._threads]
         began = min((e.start for e in self.events), default=0)
         spans = [
             {

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,7 +160,7 @@ class UnevenSampling(AxisSampling):
         assert 0 <= first <= len(self.places) - self.taps
         return self.places[first : first + self.taps]
 
-    @property
+    @cached_property
     def offsets(self) -> Array:
         """See ``AxisSampling``."""
         half = self.size // 2

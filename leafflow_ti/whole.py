@@ -26,7 +26,8 @@ def appearing(path: Path) -> Iterator[Path]:
             shutil.rmtree(path)
         scratch.replace(path)
     except OSError as error:
-        reason = error.strerror or str(error)
+        # Libraries raise with the system's number and a text of their own, of several lines.
+        reason = os.strerror(error.errno) if error.errno else " ".join(str(error).split())
         if isinstance(error, FileExistsError | NotADirectoryError):
             reason = f"{path.parent} is no folder"
         raise RunError(f"{path}: cannot be written ({reason}): mend that, or give another name") from error

@@ -19,6 +19,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="one JSON object per case instead of a table")
     parser.add_argument("--quick", action="store_true", help="smaller versions of the cases")
     parser.add_argument("--out", type=Path, default=Path("perf-output"), help="folder for pictures [perf-output]")
+    parser.add_argument("--count", type=int, help="how many inputs or kills, where a case counts them")
+    parser.add_argument("--seed", type=int, default=0, help="of what is drawn at random there [0]")
     options = parser.parse_args(arguments)
     for name in options.names:
         if find(name) is None:
@@ -29,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     for case in (case for case in CASES if case.name in options.names):
         began = time.perf_counter()
         try:
-            outcome = case.load()(Options(options.out, options.quick, case.name))
+            outcome = case.load()(Options(options.out, options.quick, case.name, options.count, options.seed))
         except LeafflowError as error:
             print(f"error: {case.name}: {error}", file=sys.stderr)
             return error.exit_code

@@ -9,16 +9,19 @@ from pathlib import Path
 
 from perf.dissertation.goals import EXPERIMENTS
 from perf.figures import Outcome
+from perf.kills.ways import WAYS
 
 
 @dataclass(frozen=True)
 class Options:
     """``out``: folder for pictures. ``quick``: a smaller version of the case, for a first look and for tests.
-    ``case``: the name under which it was called."""
+    ``case``: the name under which it was called. ``count``, ``seed``: of random inputs; None: the case's own count."""
 
     out: Path
     quick: bool = False
     case: str = ""
+    count: int | None = None
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,9 @@ CASES = (
     Case("hypocotyl", "hypocotyl:run", "flow of a growing seedling, one camera"),
     Case("plan-rig", "plan_rig:run", "errors predicted for a camera rig against the scatter of simulated estimates"),
     Case("rig-check", "rig_check:run", "a camera 10 µm off its place: found by check, depth without and with its line"),
+    Case("kills", "kills.case:run", "runs killed at random moments and resumed: every byte as undisturbed; all ways"),
+    *(Case(f"kills-{name}", "kills.case:run", f"the same, {name} alone") for name in WAYS),
+    Case("power-loss", "kills.power:run", "power that fails, a disk that fills up, at every step of filling a store"),
     Case("cold-start", "cold_start:run", "seconds from command to first result, on an empty kernel cache and after it"),
     Case("stages", "stages:run", "microseconds per output pixel and stage, share of the machine's ceilings; memory"),
     Case(
@@ -79,6 +85,8 @@ CASES = (
     ),
     Case("sequence", "sequence:run_sequence", "30 frames from files against 12: time per frame, peak memory"),
     Case("large", "sequence:run_large", "1600x1200 pixels by 9 cameras within a memory cap"),
+    Case("memory", "memory:run", "peak memory against --max-memory, over models, options and kinds of images"),
+    Case("soak", "soak:run", "520 frames, 200 runs, 200 estimates in one process: memory, handles and pace stay flat"),
     Case("scene-flow-ratio", "ratio:run", "affine-scene-flow against affine-4d on the same capture"),
     Case(
         "estimator-cells",
@@ -102,6 +110,15 @@ CASES = (
     ),
     Case("refine-coverage", "refinement.coverage:run", "whether the refinement's error bars are true, by noise"),
     Case("refine-time", "refinement.timing:run", "what the refinement costs beside the affine stages, and by image"),
+    Case(
+        "fuzz", "fuzz.driver:run", "hostile input of every kind: values or one clear line, in bounded time and memory"
+    ),
+    Case("workers", "workers:run", "what a second worker brings: processes, a local Dask cluster, whole runs"),
+    Case(
+        "interrupt", "interrupt:run", "every command, interrupted at moments spread over its time: seconds to its end"
+    ),
+    Case("kernel-cache", "kernel_cache:run", "one empty cache for four processes at once; caches cut off and garbled"),
+    Case("network", "network:run", "internet sockets of the commands as strace sees them"),
     Case("scaling", "scaling:run", "cost against image size, cameras, window, stride, sigma and columns, as a picture"),
 )
 

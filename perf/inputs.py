@@ -33,7 +33,7 @@ def described(folder: Path, description: dict[str, Any]) -> FileCapture:
     """Write ``folder/capture.toml`` and open it."""
     folder.mkdir(parents=True, exist_ok=True)
     write_description(folder / FILE_NAME, Description.model_validate(description))
-    return open_capture(folder)
+    return open_capture(folder, outside=True)
 
 
 def read_pfm(path: Path) -> NDArray[np.float64]:

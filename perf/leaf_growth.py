@@ -17,10 +17,10 @@ import numpy as np
 import tifffile
 
 from leafflow_ti import metrics
-from leafflow_ti.api import run as run_capture
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import load_config
 from leafflow_ti.results import ResultStore
+from leafflow_ti.runs import run as run_capture
 from leafflow_ti.surface_growth import measure_growth
 from leafflow_ti.synthetic.leaf import LeafScene, isotropic, render_image, truth
 from leafflow_ti.synthetic.material import BrightnessTerm

@@ -119,7 +119,7 @@ def _of_refinement(settings: Settings, capture: Capture, machine: Machine) -> li
     seconds: dict[str, list[float]] = {"splines": [], "refine": []}
     for _ in range(settings.repeats):
         before = trace.seconds
-        pipeline.run(set(), lambda *_: None)
+        pipeline.run(lambda *_: None)
         for stage, found in seconds.items():
             found.append(trace.seconds[stage] - before.get(stage, 0.0))
     pixels = len(plan.y) * len(plan.x)

@@ -94,8 +94,8 @@ def errors(scene: Scene, store: ResultStore, tracks: Tracks) -> Errors:
 
 def measured_store(scene: Scene, path: Path, settings: Settings) -> ResultStore:
     """What is measured in the images of a scene."""
-    from leafflow_ti.api import run
     from leafflow_ti.config import load_config
+    from leafflow_ti.runs import run
 
     shape = (scene.n_frames, scene.n_rows, scene.n_cols, scene.size[1], scene.size[0])
     images = np.empty(shape, np.float32)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import functools
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +29,38 @@ from leafflow_ti.models import MODELS, ColumnSet, column_set
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.sampling import Sampling
 from leafflow_ti.stages.tensor import Band
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # In the background of a script Ctrl-C is ignored, and programs that tests start and stop would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+TOGETHER = {
+    "estimate": "estimators kernels_estimate kernels_status kernels_tensor kernels_accuracy cut_windows second_order "
+    "identifiability",
+    "adaptive": "adaptive adaptive_scenes adaptive_runs adaptive_times",
+    "refine": "refine refine_pipeline refine_warp refine_twin speckle leaf_growth strain_peers",
+    "rig": "rig rig_check check",
+}
+"""Files, but for ``test_`` and ``.py``, that need the same kernels: one worker runs them, and compiles these once."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """``--dist loadfile`` that keeps the files of ``TOGETHER`` together, too."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    group_of = {f"test_{name}.py": group for group, names in TOGETHER.items() for name in names.split()}
+    absent = [name for name in group_of if not (Path(__file__).parent / name).is_file()]
+    assert not absent, f"TOGETHER names {absent}, which do not exist"
+
+    class ByKernels(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            return group_of.get(Path(file).name, file)
+
+    return ByKernels(config, log)
 
 
 @pytest.fixture(params=CASES, ids="-".join)

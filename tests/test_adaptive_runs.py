@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from small_plane import capture_of, files_of
 from test_cli import call
-from test_pipeline import capture_of, files_of
 from test_trace import assert_nested, events_of
 
 import leafflow_ti as lf
@@ -67,7 +67,7 @@ def test_another_search_is_not_resumed(capture: Capture, tmp_path: Path, changed
     one_frame = {**OPTIONS, "frames": "1:2"}
     with pytest.raises(KeyboardInterrupt):
         lf.run(capture, tmp_path / "out.zarr", load_config(overrides=one_frame), progress=stopping_after(1))
-    with pytest.raises(RunError, match=r"cannot be resumed: its config differs"):
+    with pytest.raises(RunError, match=r"cannot be resumed, it belongs to another run: (config|preshift|search|plan)"):
         lf.run(capture, tmp_path / "out.zarr", load_config(overrides={**one_frame, **changed}), resume=True)
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from small_plane import assert_same, files_of
 from test_adaptive import F_PX, captured, errors, exact, rms, scene_of
 from test_cli import call
-from test_pipeline import assert_same, files_of
 
 import leafflow_ti as lf
 from leafflow_ti import plan

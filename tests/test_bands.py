@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import json
+import re
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from test_pipeline import SCENE, capture_of, config
+import tifffile
+from small_plane import SCENE, capture_of, config
 
 import leafflow_ti as lf
 from leafflow_ti import engines
+from leafflow_ti.bands import COMPILING_BYTES, PROCESS_BYTES, least_limit
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
 from leafflow_ti.config import load_config
+from leafflow_ti.config_sections import PARENT_BYTES
+from leafflow_ti.errors import ConfigError
 from leafflow_ti.kernels.refine_tables import ADDRESSED
 from leafflow_ti.pipeline import Pipeline
 from leafflow_ti.plan import Plan
@@ -23,6 +30,7 @@ from leafflow_ti.runtime import Device
 from leafflow_ti.stages.refine import RefineStage
 from leafflow_ti.stages.refine_tables import CPU_BYTES, SLOTS_PER_THREAD, Workspaces
 from leafflow_ti.stages.view import View
+from leafflow_ti.synthetic.write import write_scene
 
 LANES = 16
 WIDE = replace(SCENE, size=(150, 130))
@@ -83,23 +91,88 @@ def test_planned_memory_is_that_of_a_run(capture: Capture, device: Callable[[str
     engines.release()
     tracemalloc.start()
     try:
-        pipeline.run(set(), lambda *_: None)
+        pipeline.run(lambda *_: None)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
     assert peak == pytest.approx(plan.bytes, rel=0.2)
 
 
-def test_little_memory_lowers_the_bands_of_a_refinement(capture: Capture) -> None:
+def blank(width: int, height: int, cameras: int, frames: int) -> Capture:
+    """Images that only plans are made for: any number of them takes no memory."""
+    images = np.broadcast_to(np.zeros(1, np.uint8), (frames, 1, cameras, height, width))
+    return capture_from_array(images, Geometry(2800.0, (width / 2, height / 2), (5.0, 0.0)))
+
+
+def test_little_memory_lowers_the_bands_of_a_refinement() -> None:
     """The limit lies between the memory with a refinement and that without."""
-    plain, whole = planned(capture, refine=0, stride=1), planned(capture, stride=1)
+    images = blank(500, 400, 5, 9)
+    plain, whole = planned(images, refine=0, stride=2), planned(images, stride=2)
     assert (plain.bands, whole.bands) == (1, 1)
     assert plain.bytes < 0.8 * whole.bytes
-    limit = int(0.9 * whole.bytes / 0.8)
-    assert planned(capture, refine=0, stride=1, max_memory=limit).bands == 1
-    lowered = planned(capture, stride=1, max_memory=limit)
+    limit = least_limit(int(0.9 * whole.bytes))
+    assert planned(images, refine=0, stride=2, max_memory=limit).bands == 1
+    lowered = planned(images, stride=2, max_memory=limit)
     assert lowered.bands > 1
     assert lowered.bytes <= 0.9 * whole.bytes
+
+
+def test_limit_that_is_too_little_says_what_is_needed() -> None:
+    images = blank(3000, 400, 9, 9)
+    with pytest.raises(ConfigError, match=r"plan\.max_memory = 340M is too little: .* need (\d+)M: raise it") as error:
+        planned(images, max_memory="340M")
+    found = re.search(r"need (\d+)M", str(error.value))
+    assert found is not None
+    needed = int(found[1])
+    assert planned(images, max_memory=f"{needed}M").read_ahead == 0
+    with pytest.raises(ConfigError, match=rf"need {needed}M"):
+        planned(images, max_memory=f"{needed - 1}M")
+
+
+def test_limit_leaves_room_for_the_program(capture: Capture) -> None:
+    """However small the images are."""
+    with pytest.raises(ConfigError, match=rf"need {COMPILING_BYTES >> 20}M"):
+        planned(capture, max_memory=COMPILING_BYTES - 1)
+    plan = planned(capture, max_memory=COMPILING_BYTES)
+    assert PROCESS_BYTES + plan.bytes <= COMPILING_BYTES
+
+
+def test_workers_share_the_limit_with_the_process_that_starts_them(capture: Capture) -> None:
+    one = planned(capture, max_memory="600M", threads=1)
+    three = planned(capture, max_memory=3 * 600 * 2**20 + PARENT_BYTES, workers=3, threads=1)
+    assert (three.bytes, three.band_rows) == (one.bytes, one.band_rows)
+    least = (3 * COMPILING_BYTES + PARENT_BYTES) >> 20
+    with pytest.raises(ConfigError, match=rf"need {least}M in 3 workers"):
+        planned(capture, max_memory=f"{least - 1}M", workers=3, threads=1)
+    planned(capture, max_memory=f"{least}M", workers=3, threads=1)
+
+
+LENS = {"camera_matrix": [[900, 0, 149.5], [0, 900, 99.5], [0, 0, 1]], "distortion_coefficients": [-0.05, 0.01, 0, 0]}
+
+
+@pytest.mark.parametrize("kind", ["plain", "lens", "decoded as a whole"])
+def test_reading_is_counted_as_it_is_measured(kind: str, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    write_scene(replace(SCENE, bits=8, size=(300, 200), n_frames=1), folder)
+    if kind == "lens":
+        (folder / "lens.json").write_text(json.dumps(LENS))
+        described = (folder / "capture.toml").read_text()
+        named = re.sub(r"focal_length_px.*\nprincipal_point_px.*", 'calibration = "lens.json"', described)
+        (folder / "capture.toml").write_text(named)
+    elif kind == "decoded as a whole":
+        for path in folder.rglob("*.tif"):
+            tifffile.imwrite(path, tifffile.imread(path), compression="zlib", rowsperstrip=200)
+    images = lf.open_capture(folder)
+    images.keep_decoded(0)
+    images.read(0, 0, 0, 20, 180, 30, 270)  # once for what is remembered, such as headers
+    tracemalloc.start()
+    try:
+        window = images.read(0, 0, 0, 20, 180, 30, 270)
+        peak = tracemalloc.get_traced_memory()[1] - window.nbytes
+    finally:
+        tracemalloc.stop()
+    counted = images.reading_bytes(*window.shape)
+    assert 0.5 * counted < peak < 1.1 * counted + 4096
 
 
 def test_coefficients_stay_where_kernels_can_index_them() -> None:

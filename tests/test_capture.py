@@ -346,7 +346,7 @@ def test_the_real_light_field_opens(tmp_path: Path) -> None:
         f'pattern = "{source.as_posix()}/input_Cam{{i:03d}}.png"\norder = "sy sx"\nshape = {{ sy = 9, sx = 9 }}',
         "[camera]\nfocal_length_px = 1462.86\n[grid]\nbaseline_mm = [25, 25]\ndisparity_offset_px = [-8.605, -8.605]\n",
     )
-    capture = open_capture(tmp_path)
+    capture = open_capture(tmp_path, outside=True)
     assert (capture.shape, capture.reference) == ((1, 9, 9, 512, 512), (4, 4))
     truth = np.fromfile(source / "gt_disp_lowres.pfm", "<f4", offset=14).reshape(512, 512)[::-1]
     # A smooth, textured spot: the neighbour to the right shows it d pixels further left.

@@ -15,6 +15,7 @@ from leafflow_ti.capture.description import (
     read_description,
     write_description,
 )
+from leafflow_ti.capture.files import Reach
 from leafflow_ti.capture.pattern import Pattern
 from leafflow_ti.errors import ConfigError, InputError
 
@@ -140,19 +141,19 @@ def test_patterns_match_what_they_format(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     pattern = Pattern.parse("cam_{sx:02d}/f_{t:03d}.tif")
-    found = {path.relative_to(tmp_path).as_posix(): values for values, path in pattern.discover(tmp_path)}
+    found = {path.relative_to(tmp_path).as_posix(): values for values, path in pattern.discover(Reach(tmp_path))}
     assert found == {
         "cam_01/f_001.tif": {"sx": 1, "t": 1},
         "cam_02/f_001.tif": {"sx": 2, "t": 1},
         "cam_02/f_-02.tif": {"sx": 2, "t": -2},
     }
     assert all(pattern.format(values) == name for name, values in found.items())
-    assert Pattern.parse("no/such/{t}.tif").discover(tmp_path) == []
+    assert Pattern.parse("no/such/{t}.tif").discover(Reach(tmp_path)) == []
 
 
 def test_a_repeated_field_must_agree_and_braces_can_be_literal(tmp_path: Path) -> None:
     for name in ("a1/x{y}_1.tif", "a1/x{y}_2.tif", "a2/x{y}_02.tif"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    found = Pattern.parse("a{sx}/x{{y}}_{sx}.tif").discover(tmp_path)
+    found = Pattern.parse("a{sx}/x{{y}}_{sx}.tif").discover(Reach(tmp_path))
     assert [(values["sx"], path.name) for values, path in found] == [(1, "x{y}_1.tif"), (2, "x{y}_02.tif")]

@@ -61,7 +61,10 @@ class FakeApi:
         settings: config.RunConfig,
         *,
         resume: bool = False,
+        verify: bool = False,
         overwrite: bool = False,
+        shard: tuple[int, int] | None = None,
+        dask: str | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> RunSummary:
         self.settings, self.resume, self.overwrite = settings, resume, overwrite
@@ -90,8 +93,9 @@ def api(monkeypatch: pytest.MonkeyPatch) -> FakeApi:
     import leafflow_ti
 
     fake = FakeApi()
-    monkeypatch.setitem(sys.modules, "leafflow_ti.api", fake)
-    monkeypatch.setattr(leafflow_ti, "api", fake, raising=False)
+    for name in ("api", "runs"):
+        monkeypatch.setitem(sys.modules, f"leafflow_ti.{name}", fake)
+        monkeypatch.setattr(leafflow_ti, name, fake, raising=False)
     return fake
 
 

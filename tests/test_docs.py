@@ -20,8 +20,6 @@ from leafflow_ti.capture.description import Description
 from leafflow_ti.cli.main import COMMANDS, invoke
 from leafflow_ti.config import RunConfig
 
-pytestmark = pytest.mark.xdist_group("docs")
-
 CONTINUES = {"opening.md": "growth.md"} | dict.fromkeys(
     ("formats.md", "models.md", "performance.md", "rig.md"), "getting-started.md"
 )

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from estimate_bench import sampling_of
 from reference import growth as twin
+from small_plane import OPTIONS as SMALL_OPTIONS
+from small_plane import SCENE
+from small_plane import capture_of as small_capture
 from test_kernels_accuracy import NOISE, OPTIONS, SINUSOID, capture_of
-from test_pipeline import OPTIONS as SMALL_OPTIONS
-from test_pipeline import SCENE
-from test_pipeline import capture_of as small_capture
 
 import leafflow_ti as lf
 from leafflow_ti.api import plan_run

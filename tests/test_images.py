@@ -276,7 +276,7 @@ def test_thumbnails_are_no_pages_and_unequal_pages_are_reported(tmp_path: Path) 
 def test_missing_file_folder_and_window_outside(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="No such file"):
         probe(tmp_path / "none.tif")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="a folder, not a file"):
         probe(tmp_path)
     Image.new("L", (4, 4)).save(tmp_path / "a.tif")
     with pytest.raises(InputError, match="not inside 4 x 4"):

@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 
 import leafflow_ti as lf
 from leafflow_ti import metrics
 from leafflow_ti.capture import Geometry, capture_from_array
 from leafflow_ti.synthetic.leaf import LeafScene, isotropic, render, truth
 from leafflow_ti.synthetic.material import BrightnessTerm
-
-pytestmark = pytest.mark.xdist_group("refine")
 
 LEAF: dict[str, Any] = {
     "f_px": 900.0,

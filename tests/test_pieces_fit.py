@@ -104,7 +104,7 @@ def test_interrupted_growth_is_told_and_mended(
         patch.setattr("leafflow_ti.cli.growth.counted", lambda what: stopping(2))
         code, _, err = call("growth", store.path, "--average", 3)
     assert code == 130
-    assert err.startswith("interrupted: maps that are not whole are left out")
+    assert err.startswith("error: interrupted: maps that are not whole are left out")
     assert not set(SURFACE_NAMES) & set(ResultStore.open(store.path).names)
     said = "did not come to its end, so its maps (area_rate and others) are left out: run it again"
     commands = (

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import os
-import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,70 +13,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from small_plane import OPTIONS, SCENE, assert_same, capture_of, config, files_of, running_threads, write_compressed
 
 import leafflow_ti as lf
+from leafflow_ti.bands import least_limit
 from leafflow_ti.capture import Capture, Geometry, capture_from_array
-from leafflow_ti.config import RunConfig, load_config
-from leafflow_ti.errors import InputError
 from leafflow_ti.models import MODELS
 from leafflow_ti.plan import Plan, make_plan
-from leafflow_ti.progress import Progress, Timings
 from leafflow_ti.runtime import start
 from leafflow_ti.status import Status
-from leafflow_ti.synthetic.plane import PlaneScene, render, truth
+from leafflow_ti.synthetic.plane import render, truth
 from leafflow_ti.synthetic.write import write_scene
-
-SCENE = PlaneScene(
-    f_px=900.0,
-    baseline_mm=(0.3, 0.3),
-    n_cols=5,
-    n_frames=13,
-    size=(61, 43),
-    centre=(0.3, -0.2, 80.0),
-    zx=0.3,
-    zy=-0.2,
-    velocity=(0.021, -0.014, 0.06),
-    omega=(0.002, -0.003, 0.004),
-    wavelengths_mm=(0.6, 0.75),
-    alpha=0.4,
-    beta=1.0,
-    noise=1.0,
-)
-OPTIONS: dict[str, object] = {
-    "model": "affine-4d",
-    "motion": "rotation",
-    "preshift": (-3, 0),
-    "window": 9,
-    "sigma": 2.5,
-}
-
-
-def capture_of(scene: PlaneScene, **geometry: tuple[float, float]) -> Capture:
-    return capture_from_array(render(scene), Geometry(scene.f_px, scene.principal, scene.baseline_mm, **geometry))
 
 
 @pytest.fixture(scope="module")
 def capture() -> Capture:
     return capture_of(SCENE)
-
-
-def config(**options: object) -> RunConfig:
-    return load_config(overrides={**OPTIONS, **options})
-
-
-def files_of(store: Path) -> dict[str, str]:
-    """Checksum of every file of a store but the attributes, which hold timings."""
-    files = [p for p in store.rglob("*") if p.is_file() and p != store / "zarr.json"]
-    return {str(p.relative_to(store)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
-
-
-def assert_same(one: lf.Field, two: lf.Field, part: tuple[slice, slice] = (slice(None), slice(None))) -> None:
-    """``two`` equals ``part`` of ``one``, bit for bit."""
-    assert list(one) == list(two)
-    np.testing.assert_array_equal(one.status[part], two.status)
-    assert (two.status == 0).any()
-    for name in one:
-        assert one[name][part].tobytes() == two[name].tobytes(), name
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
@@ -134,44 +83,11 @@ def test_second_run_writes_the_same_bytes(capture: Capture, tmp_path: Path) -> N
     assert any(name.startswith("depth/c/") for name in first)
 
 
-@pytest.mark.parametrize("stop_after", [1, 4, 8])
-def test_resumed_run_ends_with_the_same_bytes(capture: Capture, tmp_path: Path, stop_after: int) -> None:
-    """Nine units; the run dies in the middle of a band, or between bands."""
-    wanted = config(frames="4:7", tile=16)
-
-    def die(progress: Progress) -> None:
-        if progress.done_units == stop_after:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        lf.run(capture, tmp_path / "out.zarr", wanted, progress=die)
-    store = lf.ResultStore.open(tmp_path / "out.zarr")
-    assert len(store.done()) == stop_after
-    first = Timings.of(store.attrs["timings"])
-    assert (first.units, first.runs) == (stop_after, 1)
-    lf.run(capture, tmp_path / "out.zarr", wanted, resume=True)
-    lf.run(capture, tmp_path / "whole.zarr", wanted)
-    assert files_of(tmp_path / "out.zarr") == files_of(tmp_path / "whole.zarr")
-    both, alone = (Timings.of(lf.ResultStore.open(tmp_path / n).attrs["timings"]) for n in ("out.zarr", "whole.zarr"))
-    assert (both.units, both.frames, both.pixels, both.runs) == (9, 3, 3 * 43 * 61, 2)
-    assert (alone.units, alone.frames, alone.pixels, alone.runs) == (9, 3, 3 * 43 * 61, 1)
-    assert both.device == alone.device
-    assert set(both.stages) == set(alone.stages) >= {"compile", "decode", "filter", "tensor", "estimate", "write"}
-    assert both.seconds > first.seconds
-    assert all(both.stages[stage] >= seconds > 0 for stage, seconds in first.stages.items())
-
-
 @pytest.fixture(scope="module")
 def on_disk(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
-    """A folder of compressed images, and what they hold: floats, some of them not finite."""
+    """A folder of compressed images, and what they hold."""
     folder = tmp_path_factory.mktemp("disk") / "capture"
-    write_scene(replace(SCENE, bits=None), folder)
-    images = render(SCENE).astype(np.float32)
-    images[6, 0, 1, 20:22, 30] = np.nan
-    for t, sx in np.ndindex(images.shape[0], images.shape[2]):
-        path = folder / f"cam_{sx:02d}" / f"frame_{t:03d}.tif"
-        tifffile.imwrite(path, images[t, 0, sx], compression="zlib", rowsperstrip=8)
-    return folder, images
+    return folder, write_compressed(folder)
 
 
 @pytest.mark.parametrize("more", [{}, {"prefilter": "highpass", "sigma_pre": 2.0}])
@@ -183,35 +99,19 @@ def test_reading_ahead_changes_nothing(
     files = lf.open_capture(folder)
     wanted = config(tile=16, frames="4:7", **more)
     assert [lf.plan_run(c, wanted).read_ahead for c in (files, in_memory)] == [2, 0]
-    threads = set(threading.enumerate())
+    threads = running_threads()
     for name, source in (("files.zarr", files), ("memory.zarr", in_memory)):
         lf.run(source, tmp_path / name, wanted)
-    assert set(threading.enumerate()) <= threads
+    assert running_threads() <= threads
     assert files_of(tmp_path / "files.zarr") == files_of(tmp_path / "memory.zarr")
     assert (lf.ResultStore.open(tmp_path / "files.zarr").read("status") == Status.NOT_FINITE).any()
 
 
-def test_unreadable_image_ends_the_run_where_it_is_needed(on_disk: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    """Frame 10 is the last one that the third unit of a band needs."""
-    folder = tmp_path / "capture"
-    shutil.copytree(on_disk[0], folder)
-    damaged = folder / "cam_02" / "frame_010.tif"
-    data = bytearray(damaged.read_bytes())
-    with tifffile.TiffFile(damaged) as tif:
-        page = tif.pages[0]
-        assert isinstance(page, tifffile.TiffPage)
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-            data[offset : offset + count] = bytes(count)
-    damaged.write_bytes(data)
-    threads = set(threading.enumerate())
-    with pytest.raises(InputError, match=r"cam_02.frame_010\.tif: page 0 cannot be decoded"):
-        lf.run(lf.open_capture(folder), tmp_path / "out.zarr", config(tile=16))
-    assert set(threading.enumerate()) <= threads
-    done = lf.ResultStore.open(tmp_path / "out.zarr").done()
-    assert done <= {0, 3}  # frames 4 and 5 of the first band; what waits to be written when it happens is dropped
-
-
-def test_little_memory_means_less_reading_ahead(on_disk: tuple[Path, np.ndarray]) -> None:
+def test_little_memory_means_less_reading_ahead(
+    on_disk: tuple[Path, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for taken in ("PROCESS_BYTES", "COMPILING_BYTES"):  # more than these small images need
+        monkeypatch.setattr(f"leafflow_ti.bands.{taken}", 0)
     files = lf.open_capture(on_disk[0])
 
     def planned(**limit: object) -> Plan:
@@ -226,7 +126,7 @@ def test_little_memory_means_less_reading_ahead(on_disk: tuple[Path, np.ndarray]
         return lf.plan_run(files, config(**large, **limit))
 
     plenty = planned()
-    scarce = planned(max_memory=int(plenty.bytes / 0.8) - 1000)
+    scarce = planned(max_memory=least_limit(plenty.bytes) - 1000)
     assert (plenty.read_ahead, scarce.read_ahead) == (2, 1)
     # 5 cameras, 4 bytes and one that says whether the value is finite; around 61 x 43 pixels one more on each side for
     # the growth, half a window, half a filter of 5 taps twice, and four sigmas of the prefilter.
@@ -254,7 +154,7 @@ def test_decoded_images_are_kept_where_bands_share_them(tmp_path: Path) -> None:
 RUN_WITH_THREADS = """
 import sys
 import leafflow_ti as lf
-from test_pipeline import SCENE, capture_of, config
+from small_plane import SCENE, capture_of, config
 for precision in ("f32", "f64"):
     options = {"frames": "6:7", "threads": int(sys.argv[1]), "precision": precision}
     lf.run(capture_of(SCENE), f"{sys.argv[2]}/{precision}.zarr", config(**options))
@@ -302,7 +202,7 @@ def test_plan_counts_every_output_plane() -> None:
 
 
 def test_the_engine_is_left_as_it_was() -> None:
-    from leafflow_ti.kernels.engine import ENGINE, LaneKernel, quick_front_end, ti
+    from leafflow_ti.kernels.engine import ENGINE, lane_kernel, quick_front_end, ti
 
     kernels = importlib.import_module(f"{ENGINE}.lang.kernel_impl")
     contexts = importlib.import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
@@ -314,7 +214,7 @@ def test_the_engine_is_left_as_it_was() -> None:
     with quick_front_end():
         assert not any(one is other for one, other in zip(settings(), usual, strict=True))
     assert settings() == usual
-    with pytest.raises(RuntimeError, match="stop"), quick_front_end():
+    with pytest.raises(RuntimeError, match="stop"), quick_front_end(), quick_front_end():
         raise RuntimeError("stop")
     assert settings() == usual
 
@@ -326,7 +226,7 @@ def test_the_engine_is_left_as_it_was() -> None:
 
     engine_wide = set_now()
     for long in (False, True):
-        whole = LaneKernel(set_now, long)
+        whole = lane_kernel(16, long)(set_now)
         whole._kernel = set_now
         assert whole() == (False, engine_wide[1] and not long)
         assert set_now() == engine_wide

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from reference.prefilter import prefilter
-from test_pipeline import OPTIONS, SCENE, assert_same, capture_of
+from small_plane import OPTIONS, SCENE, assert_same, capture_of
 
 import leafflow_ti as lf
 from leafflow_ti.api import plan_run

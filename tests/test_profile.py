@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_plane import SCENE, capture_of, config
 from test_cli import call
-from test_pipeline import SCENE, capture_of, config
 from test_trace import assert_nested, events_of
 
 import leafflow_ti as lf
@@ -45,7 +45,7 @@ def test_predicted_counts_are_those_of_a_run(capture: Capture, options: dict[str
     trace = Trace(keep=True)
     pipeline = Pipeline(plan, capture, start(), trace)
     units: list[int] = []
-    pipeline.run(set(), lambda unit, maps, status: units.append(unit.index))
+    pipeline.run(lambda unit, maps, status: units.append(unit.index))
     assert trace.events is not None
     found = Counter(event.stage for event in trace.events)
     whole = predict(pipeline, plan.bands // 2, 1.0, 1.0, {}, 0.0)
@@ -182,7 +182,8 @@ def test_unknown_case_names_the_known() -> None:
 def test_profile_has_the_options_of_run(capsys: pytest.CaptureFixture[str]) -> None:
     assert call("profile", "--help") == 0
     text = capsys.readouterr().out
-    assert all(f"--{name.replace('_', '-')} " in text for name in (*options.SETTINGS, "config", "set"))
+    measured = [name for name in options.SETTINGS if name != "workers"]  # it measures in this process
+    assert all(f"--{name.replace('_', '-')} " in text for name in (*measured, "config", "set"))
     assert all(name in text.replace("\n", " ") for name in CASES)
 
 

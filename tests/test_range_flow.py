@@ -16,8 +16,8 @@ import tifffile
 from reference import chain, estimators
 from reference import range_flow as twin
 from reference.cells import Cells
+from small_plane import assert_same, files_of
 from test_kernels_tensor import relative_error
-from test_pipeline import assert_same, files_of
 from tolerances import tolerance
 
 import leafflow_ti as lf

@@ -18,7 +18,6 @@ from leafflow_ti.synthetic.material import BrightnessTerm
 from leafflow_ti.synthetic.moving_patch import true_state
 from leafflow_ti.synthetic.plane import truth
 
-pytestmark = pytest.mark.xdist_group("refine")
 Start = Callable[[str], Device]
 
 QUIET = replace(SCENE, noise=0.1)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_pipeline import assert_same, capture_of, files_of
+from small_plane import assert_same, capture_of, files_of
 
 import leafflow_ti as lf
 from leafflow_ti import refinement
@@ -18,8 +18,6 @@ from leafflow_ti.correlation import velocity_covariance
 from leafflow_ti.field import CORRELATIONS, IDENTIFIED
 from leafflow_ti.status import Status
 from leafflow_ti.synthetic.plane import PlaneScene, truth
-
-pytestmark = pytest.mark.xdist_group("refine")
 
 SCENE = PlaneScene(
     f_px=900.0,

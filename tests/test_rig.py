@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from leafflow_ti.cli.main import _app
+from leafflow_ti.cli.app import make_app
 from leafflow_ti.config import load_config
 from leafflow_ti.errors import ConfigError, UsageError
 from leafflow_ti.rig import Rig, plan_rig
@@ -110,13 +110,13 @@ COMMAND = ["plan-rig", "--f-mm", "12", "--pitch", "0.0044", "--distance", "100",
 
 
 def test_command() -> None:
-    found = CliRunner().invoke(_app(), [*COMMAND, "--interval", "60"])
+    found = CliRunner().invoke(make_app(), [*COMMAND, "--interval", "60"])
     assert found.exit_code == 0, found.output
     assert "are taken out: depths of" in found.output
     assert "growth_rate" in found.output
     assert "%/h" in found.output
     assert "twice the baseline" in found.output
-    values = json.loads(CliRunner().invoke(_app(), [*COMMAND, "--json"]).output)
+    values = json.loads(CliRunner().invoke(make_app(), [*COMMAND, "--json"]).output)
     assert values["standard_errors"]["depth"] > 0
     assert values["preshift_px"] == [-14, 0]
     assert len(values["choices"]) > 5
@@ -131,6 +131,6 @@ def test_command() -> None:
     ],
 )
 def test_command_refuses(options: list[str], message: str) -> None:
-    found = CliRunner().invoke(_app(), [*COMMAND, *options])
+    found = CliRunner().invoke(make_app(), [*COMMAND, *options])
     assert isinstance(found.exception, UsageError)
     assert message in str(found.exception)

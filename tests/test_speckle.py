@@ -14,7 +14,6 @@ from leafflow_ti.status import Status
 from perf import speckle
 from perf.inputs import absent
 
-pytestmark = pytest.mark.xdist_group("refine")
 reason = absent(speckle.NAME)
 needs_plate = pytest.mark.skipif(reason is not None, reason=reason or "")
 FEW = speckle.Settings(steps=(0.0, 0.3, 0.7, 1.0), seeds=2)

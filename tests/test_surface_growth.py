@@ -57,7 +57,8 @@ def maps_of(seed: int | None) -> dict[str, np.ndarray]:
     growth = np.full(velocity.shape[:3], SCENE.growth_rate)
     if seed is not None:
         rng = np.random.default_rng(seed)
-        m = np.einsum("ta,yb,xc,kl,abcl->tyxk", *roots(), np.sqrt(MOTION), rng.normal(size=velocity.shape))
+        white = rng.normal(size=velocity.shape)
+        m = np.einsum("ta,yb,xc,kl,abcl->tyxk", *roots(), np.sqrt(MOTION), white, optimize=True)
         m[..., :2] += rays[..., :2] * m[..., 2:]
         velocity = velocity + m
         growth = growth + GROWTH_STD * rng.normal(size=growth.shape)

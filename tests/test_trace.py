@@ -83,6 +83,23 @@ def test_threads_are_counted_apart_and_summed(clock: list[int]) -> None:
     assert len({event.thread for event in trace.events}) == 2
 
 
+def test_threads_that_have_ended_leave_their_sums_alone(clock: list[int]) -> None:
+    """A long run reads with some new threads for every frame."""
+    trace = Trace()
+
+    def work() -> None:
+        with span("decode"):
+            spend(clock, 2)
+
+    with active(trace), span("host"):
+        for n in range(50):
+            thread = threading.Thread(target=copy_context().run, args=(work,))
+            thread.start()
+            thread.join()
+            assert trace.seconds == {"decode": 2.0 * (n + 1)}
+            assert len(trace._threads) <= 2
+
+
 def test_barrier_ends_the_spans_of_the_device_alone(clock: list[int]) -> None:
     trace = Trace(barrier=lambda: spend(clock, 5))
     with active(trace):

@@ -114,8 +114,8 @@ def test_growth_and_strain_since_the_start_are_exact(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[PlaneScene, ResultStore]:
     """A growing, turning plane, measured in noisy images: nine frames of results."""
-    from leafflow_ti.api import run
     from leafflow_ti.config import load_config
+    from leafflow_ti.runs import run
 
     scene = replace(
         noise_scene(size=(121, 101)), n_frames=17, n_cols=5, noise=1.0, bits=8, growth=linear_growth(0.3),

@@ -12,6 +12,7 @@ the last column of a projection matrix is not used.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +23,18 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 
+from leafflow_ti.capture.files import read_text
 from leafflow_ti.errors import ConfigError, InputError
 
 Array = npt.NDArray[np.float64]
 
 COEFFICIENTS = 14
+LARGEST_FILE = 2**18
+"""Bytes of a calibration, with room for the points that it was made from."""
+LARGEST_NUMBER = 1e9
+"""Of any entry: those of cameras are far below, and its square and cube can be computed with."""
+WAY_OUT = "check [camera] calibration"
+_SHOWN = 200  # characters of what another program says
 _COUNTS = (0, 4, 5, 8, 12, 14)
 _TURN_TOLERANCE = 1e-4
 """By how much ``R Rᵀ`` may differ from 1: files are written with few digits."""
@@ -59,16 +67,12 @@ def read_calibration(path: Path) -> Calibration:
     range or not supported.
     """
     try:
-        values = _parsed(path, path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{path}: calibration cannot be read ({error.strerror}): check [camera] calibration"
-        ) from error
+        values = _parsed(path, read_text(path, LARGEST_FILE, WAY_OUT))
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start}): save it as UTF-8") from error
     _check_lens_model(path, values)
     if "camera_matrix" not in values:
-        known = ", ".join(map(str, values)) or "nothing"
+        known = ", ".join(map(str, itertools.islice(values, 20)))[:_SHOWN] or "nothing"
         raise ConfigError(f"{path}: camera_matrix is missing, found {known}: give a calibration of one camera")
     matrix = _matrix(path, values, "camera_matrix", ((3, 3),))
     _check_pinhole(path, "camera_matrix", matrix)
@@ -92,7 +96,7 @@ def read_calibration(path: Path) -> Calibration:
 
 def _parsed(path: Path, text: str) -> Mapping[str, Any]:
     """Keys and values, whatever the notation; matrices of XML in the form of the others."""
-    start = text.lstrip("\ufeff \t\r\n")
+    start = text.lstrip()
     try:
         if start.startswith("<"):
             values = _from_xml(path, start)
@@ -100,8 +104,8 @@ def _parsed(path: Path, text: str) -> Mapping[str, Any]:
             values = json.loads(start)
         else:
             values = _from_yaml(start)
-    except (ElementTree.ParseError, ValueError) as error:
-        kind = " ".join(str(error).split())
+    except (ElementTree.ParseError, ValueError, RecursionError) as error:
+        kind = " ".join(str(error).split())[:_SHOWN]
         raise InputError(f"{path}: not a calibration in YAML, XML or JSON ({kind}): write it anew") from error
     if not isinstance(values, Mapping):
         raise InputError(f"{path}: holds no keys such as camera_matrix: give an OpenCV calibration file")
@@ -113,6 +117,12 @@ def _from_yaml(text: str) -> Any:
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
         """Plain values, and OpenCV's matrices as what they are written as: mappings."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            """As usual, but for aliases: few lines of these stand for more than memory holds."""
+            if self.check_event(yaml.AliasEvent):
+                raise yaml.YAMLError("aliases (*name) are not used in calibrations")
+            return super().compose_node(parent, index)
 
     Loader.add_constructor(
         "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
@@ -161,10 +171,13 @@ def _numbers(path: Path, values: Mapping[str, Any], key: str) -> tuple[Array, tu
             shape, numbers = numbers.shape, numbers.reshape(-1)
         if numbers.size != np.prod(shape):
             raise ValueError(f"{numbers.size} numbers for {' x '.join(map(str, shape))}")
-    except (KeyError, TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: {key} is no matrix with rows, cols and data ({error}): write it anew") from error
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        kind = " ".join(str(error).split())[:_SHOWN]
+        raise ConfigError(f"{path}: {key} is no matrix with rows, cols and data ({kind}): write it anew") from error
     if not np.isfinite(numbers).all():
         raise ConfigError(f"{path}: {key} holds values that are not finite: calibrate anew")
+    if np.abs(numbers).max(initial=0) > LARGEST_NUMBER:
+        raise ConfigError(f"{path}: {key} holds values beyond {LARGEST_NUMBER:g}: calibrate anew")
     return numbers, shape
 
 
@@ -178,7 +191,7 @@ def _matrix(path: Path, values: Mapping[str, Any], key: str, shapes: tuple[tuple
 
 def _check_pinhole(path: Path, key: str, matrix: Array) -> None:
     """Focal lengths above 0, no skew, the last row 0 0 1: what the pinhole model of OpenCV has."""
-    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
+    if not (matrix[0, 0] > 1 / LARGEST_NUMBER and matrix[1, 1] > 1 / LARGEST_NUMBER):
         raise ConfigError(
             f"{path}: {key} is singular or mirrored, focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g} px: both must be "
             "positive"
@@ -205,5 +218,5 @@ def _size(path: Path, values: Mapping[str, Any]) -> tuple[int, int] | None:
         return None
     try:
         return int(values["image_width"]), int(values["image_height"])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{path}: image_width or image_height is no whole number: correct it") from error

@@ -27,6 +27,9 @@ from leafflow_ti.capture.lens import Lens
 from leafflow_ti.capture.measured import FRACTION_DIGITS, LEAST_FRACTION, REACH, interpolated
 from leafflow_ti.display import table_html
 
+RESAMPLING_BYTES = 96
+"""Of a pixel that is read between those of the image: positions, coefficients, sums (92 measured, with a lens)."""
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -80,6 +83,8 @@ class Capture(ABC):
     """For each camera row and column the lens whose distortion is taken out; None: images are taken as they are."""
     flaws: Flaws | None = field(default=None, repr=False, kw_only=True)
     """Pixels that are read as NaN."""
+    outside: bool = field(default=False, repr=False, kw_only=True)
+    """Whether its files may lie outside the folder of its description: who opens it again must allow that, too."""
 
     def _repr_html_(self) -> str:
         rows = [
@@ -163,9 +168,30 @@ class Capture(ABC):
     def _window(self, t: int, sy: int, sx: int, y0: int, y1: int, x0: int, x1: int) -> Array:
         """Non-empty window inside the image, in any type; the caller does not write to it."""
 
+    def stored_rows(self, t: int, sy: int, sx: int, y0: int, y1: int) -> Array:
+        """Rows ``y0`` to ``y1`` inside one image as they are stored, whatever is made of them; do not write to it.
+
+        Raises InputError if the file cannot be decoded.
+        """
+        return self._window(t, sy, sx, y0, y1, 0, self.width)
+
+    @property
+    def reads_windows(self) -> bool:
+        """Whether a part of an image costs less than the whole."""
+        return True
+
     def image_name(self, t: int, sy: int, sx: int) -> str:
         """What to call one image in a message."""
         return f"frame {t}, camera row {sy}, column {sx}"
+
+    def reading_bytes(self, rows: int, cols: int) -> int:
+        """Memory that reading a window of one image takes for the time being, beside the window itself."""
+        resampled = 0 if self.lenses is None and self.positions_mm is None else RESAMPLING_BYTES
+        return resampled * rows * cols + self._decoding_bytes(rows, cols)
+
+    def _decoding_bytes(self, rows: int, cols: int) -> int:
+        """Of that, what the stored samples take; none where the image is in memory."""
+        return 0
 
     @property
     def cacheable_bytes(self) -> int:
@@ -174,6 +200,15 @@ class Capture(ABC):
 
     def keep_decoded(self, n_bytes: int) -> None:  # noqa: B027 - most captures keep nothing
         """Keep decoded images of at most so many bytes from now on."""
+
+    @property
+    def listing(self) -> str | None:
+        """Names, sizes and times of the files, for ``changes``; None for a capture without files."""
+        return None
+
+    def frames_of(self, name: str) -> set[int]:
+        """Frames of which a file, named as in the listing, holds images; none for a file that is not of the capture."""
+        return set()
 
     @abstractmethod
     def fingerprint(self, contents: bool = True) -> dict[str, Any]:

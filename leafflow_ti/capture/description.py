@@ -41,6 +41,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -53,18 +54,45 @@ from pydantic import (
 )
 
 from leafflow_ti.capture.channels import CHANNEL_NAMES
-from leafflow_ti.capture.pattern import AXES, Pattern
+from leafflow_ti.capture.files import read_text
+from leafflow_ti.capture.pattern import AXES, MOST_DIGITS, Pattern, path_text
 from leafflow_ti.errors import ConfigError, InputError
 
 FILE_NAME = "capture.toml"
+LARGEST_NUMBER = 1e9
+"""Of lengths [mm, px] and counts: beyond any camera, and its square and cube can be computed with."""
+LATEST = 1e12
+"""Of times [s]."""
+LARGEST_FILE = 2**20
+"""Bytes of a description: some 80,000 stamps; longer ones take parsers of TOML many seconds."""
+LARGEST_STAMPS = 64 * 2**20
+"""Bytes of a file of stamps."""
+STAMPS_WAY_OUT = "give a text file with one time in s on each line"
+_DEEPEST_KEY = 32
+_DEEP_KEY = re.compile(
+    r"""(?<![\w.-])(?:(?:"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+'|[\w-]++)[ \t]*+\.[ \t]*+)"""
+    rf"{{{_DEEPEST_KEY}}}"
+)
+"""A dotted key of more parts than any has: the time to parse one grows with their square."""
+_SHOWN = 80  # characters of a wrong value in a message
 
 
 def _as_list(value: object) -> object:
     return [value] if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
+def _not_tiny(value: float) -> float:
+    if value < 1 / LARGEST_NUMBER:
+        raise ValueError(f"input should be at least {1 / LARGEST_NUMBER:g}")
+    return value
+
+
+_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
+_Positive = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, gt=0, le=LARGEST_NUMBER), AfterValidator(_not_tiny)
+]
+_Stamp = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LATEST, le=LATEST)]
+_Index = Annotated[StrictInt, Field(gt=-(10**MOST_DIGITS), lt=10**MOST_DIGITS)]
 _PerAxis = Annotated[tuple[_Finite, ...], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
 
 
@@ -87,8 +115,8 @@ class Images(_Section):
     path: StrictStr | None = None
     axes: StrictStr | None = None
     order: StrictStr | None = None
-    shape: dict[StrictStr, Annotated[StrictInt, Field(ge=1)]] = {}
-    select: dict[StrictStr, tuple[StrictInt, ...]] = {}
+    shape: dict[StrictStr, Annotated[StrictInt, Field(ge=1, le=int(LARGEST_NUMBER))]] = {}
+    select: dict[StrictStr, tuple[_Index, ...]] = {}
     channel: Any = "luminance"
     bit_depth: Annotated[StrictInt, Field(ge=1, le=32)] | None = None
     saturated: _Finite | Literal["auto"] | None = None
@@ -205,8 +233,8 @@ class Time(_Section):
     """Sampling in time."""
 
     interval_s: _Positive | None = None
-    stamps_s: tuple[_Finite, ...] | None = None
-    stamps: StrictStr | None = None
+    stamps_s: tuple[_Stamp, ...] | None = None
+    stamps: Annotated[StrictStr, AfterValidator(path_text)] | None = None
 
     @model_validator(mode="after")
     def _one_list(self) -> Self:
@@ -230,27 +258,31 @@ def read_description(path: Path) -> Description:
     Raises InputError if it cannot be opened, ConfigError (file, key, value, way out) if its content is not valid.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, LARGEST_FILE, f"give a {FILE_NAME} or its folder")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text (byte {error.start}): save it as UTF-8") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}): give a {FILE_NAME} or its folder") from error
     try:
-        return Description.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+        return Description.model_validate(_parsed(text))
     except ValidationError as error:
         raise ConfigError(f"{path}: {_one_line(error)}") from error
+    except (ValueError, RecursionError) as error:  # not of TOML, numbers of thousands of digits, nested too deeply
+        raise ConfigError(f"{path}: not valid TOML: {_short(str(error), 2 * _SHOWN)}") from error
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    deep = _DEEP_KEY.search(text)
+    if deep is not None:
+        line = text.count("\n", 0, deep.start()) + 1
+        raise ValueError(f"a key of {_DEEPEST_KEY} parts and more (at line {line}): write [section] and key")
+    return tomllib.loads(text)
 
 
 def read_stamps(path: Path) -> tuple[float, ...]:
     """The numbers of a file with one on each line; InputError, naming the line, where there is something else."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}): give a text file with one time in s on each line"
-        ) from error
+        lines = read_text(path, LARGEST_STAMPS, STAMPS_WAY_OUT).splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text (byte {error.start}): {STAMPS_WAY_OUT}") from error
     found = []
     for number, line in enumerate(lines, 1):
         if not line.strip():
@@ -258,7 +290,7 @@ def read_stamps(path: Path) -> tuple[float, ...]:
         try:
             found.append(float(line))
         except ValueError:
-            raise InputError(f"{path}: line {number} is {line.strip()!r}: give one time in s on each line") from None
+            raise InputError(f"{path}: line {number} is {_shown(line.strip())}: {STAMPS_WAY_OUT}") from None
     return tuple(found)
 
 
@@ -286,7 +318,7 @@ def _one_line(error: ValidationError) -> str:
     """First error as '[section] key = value: what is wrong', and how many more there are."""
     errors = error.errors(include_url=False)
     first = errors[0]
-    keys = [str(part) for part in first["loc"]]
+    keys = [_short(str(part), _SHOWN) for part in first["loc"]]
     section, key = keys[0], ".".join(keys[1:])
     place = f"[{section}] {key}".rstrip()
     message = re.sub(r"^Value error, ", "", first["msg"])
@@ -295,9 +327,22 @@ def _one_line(error: ValidationError) -> str:
     elif first["type"] == "missing":
         message = "missing: add it"
     elif key and not isinstance(first["input"], dict):
-        place += f" = {first['input']!r}"
+        place += f" = {_shown(first['input'])}"
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     return f"{place}: {message}{more}"
+
+
+def _shown(value: object) -> str:
+    """A wrong value in few characters; one that Python itself does not write by its type."""
+    try:
+        return _short(repr(value), _SHOWN)
+    except (ValueError, RecursionError):
+        return f"({type(value).__name__} too long to show)"
+
+
+def _short(text: str, most: int) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= most else f"{text[: most - 4]} ..."
 
 
 def _known_keys(section: str | None) -> str:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from leafflow_ti.capture.channels import Array
 from leafflow_ti.capture.description import Images
+from leafflow_ti.capture.files import Reach
 from leafflow_ti.capture.images import read_gray
 from leafflow_ti.capture.layout import Layout
 from leafflow_ti.errors import ConfigError
@@ -44,11 +45,13 @@ class Flaws:
         return found
 
 
-def find_flaws(path: Path, images: Images, layout: Layout, dtype: np.dtype[Any], bits: int) -> Flaws | None:
+def find_flaws(
+    path: Path, images: Images, layout: Layout, reach: Reach, dtype: np.dtype[Any], bits: int
+) -> Flaws | None:
     """What the description ``path`` says of flawed pixels; None if nothing.
 
     Raises ConfigError for "auto" with grey values that have no largest one, or a file of dead pixels of another size,
-    InputError for one that cannot be read.
+    InputError for one that cannot be read, or that lies outside.
     """
     saturated = None if images.saturated is None else _level(path, images.saturated, dtype, bits)
     pattern = images.dead_pattern
@@ -56,10 +59,10 @@ def find_flaws(path: Path, images: Images, layout: Layout, dtype: np.dtype[Any],
         return None if saturated is None else Flaws(saturated)
     names = [[pattern.format({"sy": sy, "sx": sx}) for sx in layout.values["sx"]] for sy in layout.values["sy"]]
     found: Mapping[str, Mask] = {
-        name: _dead(path.parent / name, layout) for name in dict.fromkeys(n for line in names for n in line)
+        name: _dead(reach, name, layout) for name in dict.fromkeys(n for line in names for n in line)
     }
     dead = tuple(tuple(found[name] for name in line) for line in names)
-    return Flaws(saturated, dead, tuple(path.parent / name for name in found))
+    return Flaws(saturated, dead, tuple(reach.root / name for name in found))
 
 
 def _level(path: Path, stated: float | str, dtype: np.dtype[Any], bits: int) -> float:
@@ -72,7 +75,9 @@ def _level(path: Path, stated: float | str, dtype: np.dtype[Any], bits: int) -> 
     return float(2**bits - 1)
 
 
-def _dead(path: Path, layout: Layout) -> Mask:
+def _dead(reach: Reach, name: str, layout: Layout) -> Mask:
+    path = reach.root / name
+    reach.file(path)
     found: Mask = np.asarray(read_gray(path)) != 0
     wanted = (layout.info.height, layout.info.width)
     if found.shape != wanted:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from leafflow_ti.capture import simple_formats, tiff, tiff_header
 from leafflow_ti.capture.channels import Array, Channel, ImageInfo, combine, sample_weights
+from leafflow_ti.capture.stored import StoredFile, look_at
 from leafflow_ti.errors import InputError
 
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -26,11 +27,11 @@ def probe(path: str | Path) -> ImageInfo:
 
     Raises InputError, naming the file, if it is missing, of another format, damaged, or of a kind that is not read.
     """
-    path = Path(path)
-    kind = _format(path)
+    stored = look_at(Path(path))
+    kind = _format(stored)
     if kind == "tiff":
-        return tiff_header.probe(path)
-    return simple_formats.probe_png(path) if kind == "png" else simple_formats.probe_pnm(path)
+        return tiff_header.probe(stored)
+    return simple_formats.probe_png(stored) if kind == "png" else simple_formats.probe_pnm(stored)
 
 
 def read_gray(
@@ -41,18 +42,17 @@ def read_gray(
     Colour becomes grey by ``channel`` (see ``channels.sample_weights``); alpha that the file declares is ignored.
     Raises InputError for a damaged or unsuitable file and MissingExtra where imagecodecs is needed and absent.
     """
-    path = Path(path)
-    info = page_info(path, page)
-    return read_window(path, page, channel, 0, info.height, 0, info.width).astype(dtype, copy=False)
+    stored = look_at(Path(path))
+    info = _page_info(stored, page)
+    values = _window(stored, page, info, channel, (0, info.height, 0, info.width))
+    # What is too large for the type becomes infinite; the program knows what to do with that.
+    with np.errstate(over="ignore"):
+        return values.astype(dtype, copy=False)
 
 
 def page_info(path: Path, page: int) -> ImageInfo:
     """Header of one page; the pages of a TIFF may differ."""
-    if _format(path) == "tiff":
-        return tiff_header.page_at(path, page).info
-    if page != 0:
-        raise InputError(f"{path}: no page {page}, the file holds one image")
-    return probe(path)
+    return _page_info(look_at(path), page)
 
 
 def read_window(path: Path, page: int, channel: Channel, y0: int, y1: int, x0: int, x1: int) -> Array:
@@ -60,34 +60,46 @@ def read_window(path: Path, page: int, channel: Channel, y0: int, y1: int, x0: i
 
     Only the needed bytes, strips or tiles are read where ``ImageInfo.windowed`` says so. Raises like ``read_gray``.
     """
-    info = page_info(path, page)
+    stored = look_at(path)
+    info = _page_info(stored, page)
     if not (0 <= y0 < y1 <= info.height and 0 <= x0 < x1 <= info.width):
         raise InputError(f"{path}: window y {y0}:{y1}, x {x0}:{x1} is not inside {info.height} x {info.width} pixels")
-    weights = sample_weights(path, info, channel)
-    samples = tuple(index for index, _ in weights)
-    kind = _format(path)
+    return _window(stored, page, info, channel, (y0, y1, x0, x1))
+
+
+def _page_info(stored: StoredFile, page: int) -> ImageInfo:
+    kind = _format(stored)
     if kind == "tiff":
-        values = tiff.read(path, page, y0, y1, x0, x1, samples)
-    elif kind == "png":
-        values = simple_formats.read_png(path, info, samples)[y0:y1, x0:x1]
-    else:
-        values = simple_formats.read_pnm(path, y0, y1, x0, x1, samples)
-    return combine(values, weights)
+        return tiff_header.page_at(stored, page).info
+    if page != 0:
+        raise InputError(f"{stored.path}: no page {page}, the file holds one image")
+    return simple_formats.probe_png(stored) if kind == "png" else simple_formats.probe_pnm(stored)
 
 
-def _format(path: Path) -> str:
+def _window(stored: StoredFile, page: int, info: ImageInfo, channel: Channel, box: tuple[int, int, int, int]) -> Array:
+    weights = sample_weights(stored.path, info, channel)
+    samples = tuple(index for index, _ in weights)
+    kind = _format(stored)
     try:
-        stat = path.stat()
-        return _format_of(path, stat.st_size, stat.st_mtime_ns)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}): check the path and its permissions") from error
+        if kind == "tiff":
+            values = tiff.read(stored, page, box, samples)
+        elif kind == "png":
+            values = simple_formats.read_png(stored, info, samples)[box[0] : box[1], box[2] : box[3]]
+        else:
+            values = simple_formats.read_pnm(stored, box, samples)
+        return combine(values, weights)
+    except MemoryError as error:
+        raise InputError(
+            f"{stored.path}: {info.height} x {info.width} pixels need more memory than there is: crop the image, or "
+            "save it in strips or tiles"
+        ) from error
 
 
 @lru_cache(maxsize=4096)
-def _format_of(path: Path, _size: int, _mtime_ns: int) -> str:
-    """Format by the first bytes, remembered until size or time of the file change."""
-    with path.open("rb") as file:
-        head = file.read(8)
+def _format(stored: StoredFile) -> str:
+    """Format by the first bytes."""
+    with stored.open() as file:
+        head = file.read(0, min(8, stored.size))
     if head[:4] in _TIFF_MAGIC:
         return "tiff"
     if head == simple_formats.PNG_MAGIC:
@@ -95,7 +107,7 @@ def _format_of(path: Path, _size: int, _mtime_ns: int) -> str:
     if head[:2] in (b"P2", b"P3", b"P5", b"P6"):
         return "pnm"
     found = "an empty file" if not head else "another format"
-    raise InputError(f"{path}: {found}, not TIFF, PNG, PGM or PPM: convert it, or narrow the pattern")
+    raise InputError(f"{stored.path}: {found}, not TIFF, PNG, PGM or PPM: convert it, or narrow the pattern")
 
 
 def checksum(path: Path) -> str:

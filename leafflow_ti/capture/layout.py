@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy.typing as npt
 
 from leafflow_ti.capture.channels import ImageInfo, sample_weights
 from leafflow_ti.capture.description import Images
+from leafflow_ti.capture.files import FileState, Reach
 from leafflow_ti.capture.images import probe
 from leafflow_ti.capture.pattern import AXES, Pattern
 from leafflow_ti.errors import InputError
@@ -30,6 +32,7 @@ class Layout:
     """Complete table of a capture's images."""
 
     paths: tuple[Path, ...]
+    states: tuple[FileState, ...]  # of the paths, when they were found
     file: npt.NDArray[np.int64]  # [t, sy, sx], index into paths
     page: npt.NDArray[np.int64]  # [t, sy, sx]
     values: dict[str, tuple[int, ...]]  # the numbers of the file names along t, sy, sx; (0,) for an axis not named
@@ -37,27 +40,28 @@ class Layout:
     info: ImageInfo
 
 
-def find_layout(images: Images, root: Path, gaps: bool = False) -> Layout:
-    """Find and check all images of a description whose paths are relative to ``root``; headers only.
+def find_layout(images: Images, reach: Reach, gaps: bool = False, known: Layout | None = None) -> Layout:
+    """Find and check all images of a description, in its folder or where ``reach`` allows; headers only.
 
-    ``gaps``: whether numbers of frames may be left out, as where each frame has a time of its own.
+    ``gaps``: whether numbers of frames may be left out, as where each frame has a time of its own. ``known``: an
+    earlier state of it; headers of files that are as they were then are not read again.
     """
-    pattern = images.file_pattern
-    everything = list(pattern.discover(root))
-    found = [(fields, path) for fields, path in everything if _selected(fields, images.select)]
+    pattern, root = images.file_pattern, reach.root
+    everything = pattern.discover(reach)
+    found = [(fields, path) for fields, path in everything if selected(fields, images.select)]
     if not found:
         raise InputError(f"no file fits {root / pattern.text}: check the pattern, its padding ({{t:03d}}), and select")
     first_index = min((fields["i"] for fields, _ in found if "i" in fields), default=0)
     files = _by_value(found, images, first_index)
-    values = _axis_values(files, pattern, images, gaps)
-    keys = list(itertools.product(*(values[axis] for axis in AXES)))
-    missing = [key for key in keys if key not in files]
-    if missing:
-        names = [str(root / _file_name(pattern, key, images, first_index)) for key in missing]
-        raise InputError(f"{len(missing)} of {len(keys)} images are missing: {_list(names)}: add them, or use select")
-    paths = tuple(files[key] for key in keys)
-    info = _common_info(paths, images)
-    file = np.arange(len(keys)).reshape([len(values[axis]) for axis in AXES])
+    ranges = _axis_values(files, pattern, images, gaps)
+    _check_complete(files, ranges, lambda key: str(root / _file_name(pattern, key, images, first_index)))
+    values = {axis: tuple(found) for axis, found in ranges.items()}
+    paths = tuple(files[key] for key in itertools.product(*(values[axis] for axis in AXES)))
+    states = tuple(FileState.of(reach.file(path)) for path in paths)
+    before = dict(zip(known.paths, known.states, strict=True)) if known else {}
+    new = [path for path, state in zip(paths, states, strict=True) if before.get(path) != state]
+    info = _common_info(new, images, known.info if known else None)
+    file = np.arange(len(paths)).reshape([len(values[axis]) for axis in AXES])
     page = np.zeros_like(file)
     sizes = _page_sizes(paths[0], info, images)
     if sizes:
@@ -69,7 +73,8 @@ def find_layout(images: Images, root: Path, gaps: bool = False) -> Layout:
         file, page = (np.ascontiguousarray(table) for table in np.broadcast_arrays(file, page + pages))
         values |= {axis: tuple(range(size)) for axis, size in sizes.items()}
     named = {axis: sorted({fields[axis] for fields, _ in everything}) for axis in images.select}
-    return Layout(paths, file, page, values, values | {axis: tuple(n) for axis, n in named.items()}, info)
+    found_values = values | {axis: tuple(n) for axis, n in named.items()}
+    return Layout(paths, states, file, page, values, found_values, info)
 
 
 _Key = tuple[int, ...]  # values along AXES
@@ -89,7 +94,8 @@ def _by_value(found: Sequence[tuple[dict[str, int], Path]], images: Images, firs
     return files
 
 
-def _selected(fields: Mapping[str, int], select: Mapping[str, tuple[int, ...]]) -> bool:
+def selected(fields: Mapping[str, int], select: Mapping[str, tuple[int, ...]]) -> bool:
+    """Whether a file with these numbers is one that a description selects."""
     return all(fields[axis] in _select_range(chosen) for axis, chosen in select.items())
 
 
@@ -98,44 +104,82 @@ def _select_range(chosen: tuple[int, ...]) -> range:
 
 
 def _unfold(index: int, images: Images, path: Path) -> dict[str, int]:
-    sizes = [images.shape[axis] for axis in images.index_axes]
-    if index >= math.prod(sizes):
-        raise InputError(f"{path}: image {index + 1} of a shape with {math.prod(sizes)}: correct shape, or the pattern")
-    return dict(zip(images.index_axes, (int(k) for k in np.unravel_index(index, sizes)), strict=True))
+    total = math.prod(images.shape[axis] for axis in images.index_axes)
+    if index >= total:
+        raise InputError(f"{path}: image {index + 1} of a shape with {total}: correct shape, or the pattern")
+    at = {}
+    for axis in reversed(images.index_axes):  # whole numbers of any size, unlike those of NumPy
+        index, at[axis] = divmod(index, images.shape[axis])
+    return at
 
 
-def _axis_values(files: Iterable[_Key], pattern: Pattern, images: Images, gaps: bool) -> dict[str, tuple[int, ...]]:
+def _axis_values(files: Iterable[_Key], pattern: Pattern, images: Images, gaps: bool) -> dict[str, Sequence[int]]:
     """Values that each axis should have: evenly spaced between the first and the last found, or as selected; with
-    ``gaps`` frames are those that are found."""
-    result = {}
+    ``gaps`` frames are those that are found. Ranges: two files with far numbers stand for more than memory holds."""
+    result: dict[str, Sequence[int]] = {}
     for k, axis in enumerate(AXES):
         found = sorted({key[k] for key in files})
         if axis in images.index_axes:
-            result[axis] = tuple(range(images.shape[axis]))
+            result[axis] = range(images.shape[axis])
         elif axis == "t" and gaps:
             result[axis] = tuple(found)
         elif axis in images.select:
-            result[axis] = tuple(_select_range(images.select[axis]))
+            result[axis] = _select_range(images.select[axis])
         elif axis in pattern.fields and len(found) > 1:
             step = math.gcd(*(b - a for a, b in itertools.pairwise(found)))
-            result[axis] = tuple(range(found[0], found[-1] + 1, step))
+            result[axis] = range(found[0], found[-1] + 1, step)
         else:
             result[axis] = tuple(found)
     return result
+
+
+def _check_complete(
+    files: Mapping[_Key, Path], values: Mapping[str, Sequence[int]], name: Callable[[_Key], str]
+) -> None:
+    """InputError, naming the first, where there is not a file for each combination of values."""
+    wanted = math.prod(len(values[axis]) for axis in AXES)
+    if wanted == len(files):  # none has values that are not wanted
+        return
+    surplus = [str(path) for path in _surplus(files)]
+    if surplus:
+        raise InputError(
+            f"{len(surplus)} image(s) of frames that most cameras do not have: {_list(surplus)}: remove them, add "
+            "those of the other cameras, or use select"
+        )
+    keys = ((t, sy, sx) for t in values["t"] for sy in values["sy"] for sx in values["sx"])
+    missing = itertools.islice((key for key in keys if key not in files), _SHOWN)
+    number = wanted - len(files)
+    raise InputError(
+        f"{number} of {wanted} images are missing: {_list([name(key) for key in missing], number)}: add them, or use "
+        "select"
+    )
+
+
+def _surplus(files: Mapping[_Key, Path]) -> list[Path]:
+    """Files of frames that fewer than half of the cameras have, where all is complete without these."""
+    cameras = {key[1:] for key in files}
+    count = Counter(key[0] for key in files)
+    few = {t for t, n in count.items() if 2 * n < len(cameras)}
+    surplus = [path for key, path in files.items() if key[0] in few]
+    return surplus if len(files) - len(surplus) == (len(count) - len(few)) * len(cameras) else []
 
 
 def _file_name(pattern: Pattern, key: _Key, images: Images, first_index: int) -> str:
     """Name that a missing image should have."""
     fields = dict(zip(AXES, key, strict=True))
     if images.index_axes:
-        sizes = [images.shape[axis] for axis in images.index_axes]
-        fields["i"] = first_index + int(np.ravel_multi_index([fields[axis] for axis in images.index_axes], sizes))
+        index = 0
+        for axis in images.index_axes:
+            index = index * images.shape[axis] + fields[axis]
+        fields["i"] = first_index + index
     return pattern.format(fields)
 
 
-def _common_info(paths: Sequence[Path], images: Images) -> ImageInfo:
-    """Header of the first file, after checking that all others agree with it."""
-    first = probe(paths[0])
+def _common_info(paths: Sequence[Path], images: Images, known: ImageInfo | None) -> ImageInfo:
+    """Header of the first file, or the ``known`` one, after checking that all others agree with it."""
+    if known is not None and not paths:
+        return known
+    first = known or probe(paths[0])
     unlike = []
     for path in paths:
         info = probe(path)
@@ -187,6 +231,8 @@ def _page_sizes(path: Path, info: ImageInfo, images: Images) -> dict[str, int]:
     return dict(zip(axes, sizes, strict=True))
 
 
-def _list(names: Sequence[str]) -> str:
-    rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+def _list(names: Sequence[str], total: int | None = None) -> str:
+    """The first names; ``total``: how many there are, where ``names`` are the first of them."""
+    total = len(names) if total is None else total
+    rest = f" and {total - _SHOWN} more" if total > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + rest

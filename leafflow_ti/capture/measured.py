@@ -12,7 +12,8 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from leafflow_ti.capture.description import Description, read_stamps
+from leafflow_ti.capture.description import STAMPS_WAY_OUT, Description, read_stamps
+from leafflow_ti.capture.files import Reach
 from leafflow_ti.capture.layout import Layout
 from leafflow_ti.errors import ConfigError
 
@@ -105,7 +106,7 @@ def stated_positions(
 
 
 def stated_stamps(
-    path: Path, description: Description, layout: Layout
+    path: Path, description: Description, layout: Layout, reach: Reach
 ) -> tuple[tuple[float, ...] | None, float | None]:
     """Measured time of the frames that are used, see ``time_stamps``, and the nominal interval between them [s], by
     default the median step; None where not stated."""
@@ -114,7 +115,8 @@ def stated_stamps(
         return None, time.interval_s if time else None
     name, values = f"{path}: [time] stamps_s", time.stamps_s
     if values is None:
-        file = path.parent / str(time.stamps)
+        file = reach.root / str(time.stamps)
+        reach.file(file, STAMPS_WAY_OUT)
         name, values = str(file), read_stamps(file)
     used = layout.values["t"]
     stamps = time_stamps([values[i] for i in _selected(len(values), layout.found["t"], used)], len(used), name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import numpy.typing as npt
 from leafflow_ti.capture.cache import ImageCache
 from leafflow_ti.capture.capture import Geometry
 from leafflow_ti.capture.description import FILE_NAME, Description, read_description
+from leafflow_ti.capture.files import Reach
 from leafflow_ti.capture.flaws import find_flaws
-from leafflow_ti.capture.layout import find_layout
+from leafflow_ti.capture.layout import Layout, find_layout
 from leafflow_ti.capture.measured import (
     camera_positions,
     nominal_interval,
@@ -27,24 +29,36 @@ from leafflow_ti.errors import ConfigError, InputError
 DEFAULT_CACHE_BYTES = 512 * 2**20
 
 
-def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> FileCapture:
+def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES, *, outside: bool = False) -> FileCapture:
     """Open a ``capture.toml``, or the folder that holds one; reads headers only.
 
-    ``cache_bytes`` bounds the decoded images that are kept. Raises ConfigError for an invalid description, InputError,
-    naming files, for missing, doubled, unreadable or unequal images.
+    ``cache_bytes`` bounds the decoded images that are kept. ``outside``: whether the description may name files outside
+    its own folder, directly or by links. Raises ConfigError for an invalid description, InputError, naming files, for
+    missing, doubled, unreadable or unequal images, and for those outside.
     """
-    path = Path(path)
-    if path.is_dir():
-        path = path / FILE_NAME
-    description = read_description(path)
+    path = description_path(path)
+    return open_described(path, read_description(path), Reach(path.parent, outside), ImageCache(cache_bytes))
+
+
+def description_path(path: str | Path) -> Path:
+    """The ``capture.toml`` of a folder, or the path itself."""
+    folder = os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises for names that are too long
+    return Path(path) / FILE_NAME if folder else Path(path)
+
+
+def open_described(
+    path: Path, description: Description, reach: Reach, cache: ImageCache, known: Layout | None = None
+) -> FileCapture:
+    """The capture of a description that was read from ``path``; see ``open_capture``, ``known``: ``find_layout``."""
     time = description.time
-    layout = find_layout(description.images, path.parent, gaps=time is not None and bool(time.stamps_s or time.stamps))
+    gaps = time is not None and bool(time.stamps_s or time.stamps)
+    layout = find_layout(description.images, reach, gaps, known)
     info = layout.info
     n_frames, n_rows, n_cols = layout.file.shape
     bits = description.images.bit_depth or info.bits
-    rectified = find_rectification(path, description.camera, layout)
+    rectified = find_rectification(path, description.camera, layout, reach)
     geometry = _geometry(path, description, rectified, n_rows, n_cols, info.height, info.width)
-    stamps, interval = stated_stamps(path, description, layout)
+    stamps, interval = stated_stamps(path, description, layout, reach)
     return FileCapture(
         n_frames=n_frames,
         n_rows=n_rows,
@@ -63,8 +77,9 @@ def open_capture(path: str | Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Fi
         layout=layout,
         channel=description.images.channel,
         lenses=rectified.lenses if rectified else None,
-        flaws=find_flaws(path, description.images, layout, info.dtype, bits),
-        _cache=ImageCache(cache_bytes),
+        outside=reach.outside,
+        flaws=find_flaws(path, description.images, layout, reach, info.dtype, bits),
+        _cache=cache,
     )
 
 

@@ -23,7 +23,8 @@ _MIN_SIZE = 16
 _BAND_PX = (1.0, 10.0)  # standard deviations of the Gaussians whose difference is the band pass
 _LEAST_KNOWN = 1e-3  # share of a neighbourhood of which a mean is formed
 _CROSS_PX = 2  # misalignment across the grid axis that is tolerated
-_CLEAR = 0.3  # correlation of a clear peak; independent noise stays below 0.15
+CLEAR = 0.3
+"""Correlation of a clear peak; independent noise stays below 0.15."""
 _REPEAT = 0.7  # an image that resembles itself elsewhere this well, relative to its neighbour, repeats itself
 _FRAMES, _LINES, _PAIRS = 2, 3, 4  # images that are compared: frames, camera lines, pairs per line
 
@@ -48,20 +49,20 @@ def find_preshift(capture: Capture) -> tuple[int, int]:
 
 def _along(capture: Capture, axis: str) -> float:
     """Disparity per step along one grid axis, with its fraction."""
-    load = _Loader(capture, axis)
+    load = Loader(capture, axis)
     count = capture.n_cols if axis == "x" else capture.n_rows
     nu = _neighbour_peak(capture, axis, load)
     reach = 1
     while reach < count - 1:
         wider = min(2 * reach, count - 1)
-        curve = _correlation(load, _pairs(capture, axis, wider))
+        curve = correlation(load, _pairs(capture, axis, wider))
         window = int(np.ceil(0.75 * wider / reach))
         middle, zero = round(nu * wider), len(curve) // 2
         if abs(middle) + window >= zero:
             break  # the wider pair hardly overlaps any more
         part = curve[zero + middle - window : zero + middle + window + 1]
         lag = middle - window + int(np.argmax(part))
-        if curve[zero + lag] < _CLEAR or abs(lag - middle) == window:
+        if curve[zero + lag] < CLEAR or abs(lag - middle) == window:
             break  # other surfaces take over, the nearer cameras have the better answer
         nu, reach = (lag + _vertex(curve, zero + lag)) / wider, wider
     return nu
@@ -69,15 +70,15 @@ def _along(capture: Capture, axis: str) -> float:
 
 def _neighbour_peak(capture: Capture, axis: str, load: Callable[[_Key], _Image]) -> float:
     """Lag of the clear peak between neighbours, once repetition and a wrong order of the cameras are excluded."""
-    curve = _correlation(load, _pairs(capture, axis, 1))
+    curve = correlation(load, _pairs(capture, axis, 1))
     zero = len(curve) // 2
     peaks = _maxima(curve)
     height = curve[peaks].max(initial=0.0)
-    if height < _CLEAR:
+    if height < CLEAR:
         raise UnclearDisparity(
-            f"no clear disparity along {axis}: neighbours correlate by {height:.2f}, {_CLEAR} is needed: {_WAY_OUT}"
+            f"no clear disparity along {axis}: neighbours correlate by {height:.2f}, {CLEAR} is needed: {_WAY_OUT}"
         )
-    itself = _correlation(load, ((one, one) for one, _ in _pairs(capture, axis, 1)))
+    itself = correlation(load, ((one, one) for one, _ in _pairs(capture, axis, 1)))
     elsewhere = _maxima(itself)
     elsewhere = elsewhere[elsewhere != zero]
     if itself[elsewhere].max(initial=0.0) >= _REPEAT * height:
@@ -110,18 +111,23 @@ def _in_front(capture: Capture, axis: str, lag: int) -> bool:
 
 
 @dataclass
-class _Loader:
-    """Band-passed middles of images, the grid axis last; each image is prepared once."""
+class Loader:
+    """Band-passed middles of images, the grid axis last; each image is prepared once.
+
+    ``across``: most pixels across the grid axis, of ``_MAX_CROP`` along both.
+    """
 
     capture: Capture
     axis: str
+    across: int = _MAX_CROP
 
     def __post_init__(self) -> None:
         self._kept: dict[tuple[int, int, int], _Image] = {}
 
     def __call__(self, key: tuple[int, int, int]) -> _Image:
         if key not in self._kept:
-            height, width = min(self.capture.height, _MAX_CROP), min(self.capture.width, _MAX_CROP)
+            most = (self.across, _MAX_CROP) if self.axis == "x" else (_MAX_CROP, self.across)
+            height, width = min(self.capture.height, most[0]), min(self.capture.width, most[1])
             y0, x0 = (self.capture.height - height) // 2, (self.capture.width - width) // 2
             image = self.capture.read(*key, y0, y0 + height, x0, x0 + width, dtype=np.float64)
             self._kept[key] = _band_pass(image if self.axis == "x" else image.T)
@@ -183,7 +189,7 @@ def _band_pass(image: _Image) -> _Image:
     return result
 
 
-def _correlation(load: Callable[[_Key], _Image], pairs: Iterable[tuple[_Key, _Key]]) -> _Image:
+def correlation(load: Callable[[_Key], _Image], pairs: Iterable[tuple[_Key, _Key]]) -> _Image:
     """Normalised correlation for lags ``-W/2 .. W/2`` along the last axis, summed over pairs, best misalignment."""
     total: npt.NDArray[np.float64] = np.zeros(())
     for one, other in pairs:

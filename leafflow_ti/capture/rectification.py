@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from leafflow_ti.capture.calibration import Calibration, read_calibration
+from leafflow_ti.capture.calibration import WAY_OUT, Calibration, read_calibration
 from leafflow_ti.capture.description import Camera
+from leafflow_ti.capture.files import Reach
 from leafflow_ti.capture.layout import Layout
 from leafflow_ti.capture.lens import Lens
 from leafflow_ti.errors import ConfigError
@@ -26,18 +27,18 @@ class Rectification:
     principal_px: tuple[float, float]
 
 
-def find_rectification(path: Path, camera: Camera | None, layout: Layout) -> Rectification | None:
+def find_rectification(path: Path, camera: Camera | None, layout: Layout, reach: Reach) -> Rectification | None:
     """Read the calibrations that the description ``path`` names; None if it names none.
 
     The rectified camera is that of the projection matrices, which must agree; without these the mean of all cameras.
-    Raises InputError for files that cannot be read, ConfigError for what is missing or contradictory.
+    Raises InputError for files that cannot be read or lie outside, ConfigError for what is missing or contradictory.
     """
     pattern = camera.calibration_pattern if camera else None
     if camera is None or pattern is None:
         return None
     rows, cols = layout.values["sy"], layout.values["sx"]
     names = [[pattern.format({"sy": sy, "sx": sx}) for sx in cols] for sy in rows]
-    found = {name: _read(path.parent / name, layout) for name in dict.fromkeys(n for line in names for n in line)}
+    found = {name: _read(reach, name, layout) for name in dict.fromkeys(n for line in names for n in line)}
     # Every camera counts, also where several share a file.
     f_px, principal = _pinhole([found[name] for line in names for name in line])
     _check_stated(path, camera, f_px, principal)
@@ -45,7 +46,9 @@ def find_rectification(path: Path, camera: Camera | None, layout: Layout) -> Rec
     return Rectification(lenses, f_px, principal)
 
 
-def _read(path: Path, layout: Layout) -> Calibration:
+def _read(reach: Reach, name: str, layout: Layout) -> Calibration:
+    path = reach.root / name
+    reach.file(path, WAY_OUT)
     found, size = read_calibration(path), (layout.info.width, layout.info.height)
     if found.size not in (None, size):
         made, wanted = (f"{w} x {h}" for w, h in (found.size or size, size))

@@ -2,79 +2,88 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from leafflow_ti.capture.channels import Array
-from leafflow_ti.capture.tiff_header import TiffImage, one_line, page_at, quiet, segment_grid
+from leafflow_ti.capture.stored import OpenFile, StoredFile, one_line
+from leafflow_ti.capture.tiff_header import TiffImage, page_at, quiet, segment_grid
+from leafflow_ti.capture.tiff_segments import has_imagecodecs
 from leafflow_ti.errors import InputError, LeafflowError, MissingExtra
 from leafflow_ti.trace import span
 
+Box = tuple[int, int, int, int]
+"""First row, row after the last, first column, column after the last."""
 
-def read(path: Path, page: int, y0: int, y1: int, x0: int, x1: int, samples: tuple[int, ...]) -> Array:
-    """Samples ``[y1-y0, x1-x0, len(samples)]`` of a non-empty window inside the page, in the page's own type.
 
-    Raises InputError (damaged data) or MissingExtra (a compression that needs imagecodecs).
+def read(stored: StoredFile, page: int, box: Box, samples: tuple[int, ...]) -> Array:
+    """Samples ``[rows, columns, len(samples)]`` of a non-empty window inside the page, in the page's own type.
+
+    Raises InputError (damaged data, a file that changed) or MissingExtra (a compression that needs imagecodecs).
     """
-    source = page_at(path, page)
+    source = page_at(stored, page)
     height, width = source.stored_shape
-    box = (y0, y1, x0, x1) if source.orientation == 1 else (0, height, 0, width)
-    stored = (0,) if source.palette is not None else samples
+    whole = source.orientation != 1
     try:
-        if source.contiguous is not None:
-            result = _plain_window(path, source, source.contiguous, box, stored)
-        else:
-            with quiet(), path.open("rb") as file:
-                result = _decoded_window(file, source, box, stored)
-    except LeafflowError:
+        with quiet(), stored.open(buffering=0) as file:
+            load = _plain_window if source.contiguous is not None else _decoded_window
+            result = load(
+                file, source, (0, height, 0, width) if whole else box, (0,) if source.palette is not None else samples
+            )
+    except (LeafflowError, MemoryError):
         raise
     except Exception as error:
-        if (isinstance(error, ImportError) or "imagecodecs" in str(error)) and not _has_imagecodecs():
+        path = stored.path
+        if (isinstance(error, ImportError) or "imagecodecs" in str(error)) and not has_imagecodecs():
             raise MissingExtra("imagecodecs", "codecs", f"reading {path}") from error
         raise InputError(f"{path}: page {page} cannot be decoded ({one_line(error)}): write the file again") from error
     if source.inverted:
         result = (2**source.info.bits - 1) - result
     if source.palette is not None:
         result = np.stack([source.palette[k][result[..., 0]] for k in samples], axis=-1)
-    if source.orientation != 1:
-        result = _orient(result, source.orientation)[y0:y1, x0:x1]
+    if whole:
+        result = _orient(result, source.orientation)[box[0] : box[1], box[2] : box[3]]
     return result
 
 
-def _plain_window(
-    path: Path, page: TiffImage, dtype: np.dtype[Any], box: tuple[int, int, int, int], samples: tuple[int, ...]
-) -> Array:
-    """Window of uncompressed data, mapped: only the touched parts of the file are read."""
-    (height, width), (y0, y1, x0, x1), n = page.stored_shape, box, page.stored_samples
-    shape = (n, height, width) if page.separate else (height, width, n)
-    mapped = np.memmap(path, dtype, "r", page.offsets[0], shape)
-    whole = np.moveaxis(mapped, 0, -1) if page.separate else mapped
+def _plain_window(file: OpenFile, page: TiffImage, box: Box, samples: tuple[int, ...]) -> Array:
+    """Window of uncompressed data: only the bytes of its rows are read."""
+    dtype, (height, width) = page.contiguous, page.stored_shape
+    assert dtype is not None
+    if not page.separate:
+        stored = _rows(file, page.offsets[0], dtype, page.stored_samples, width, box)
+        return stored if samples == tuple(range(page.stored_samples)) else stored[..., list(samples)]
+    plane = height * width * dtype.itemsize
+    return np.concatenate([_rows(file, page.offsets[0] + k * plane, dtype, 1, width, box) for k in samples], axis=-1)
+
+
+def _rows(file: OpenFile, offset: int, dtype: np.dtype[Any], samples: int, width: int, box: Box) -> Array:
+    """Window ``[rows, columns, samples]`` of interleaved samples, in the machine's byte order."""
+    y0, y1, x0, x1 = box
+    pixel = samples * dtype.itemsize
     with span("read"):
-        return np.array(whole[y0:y1, x0:x1, list(samples)], dtype.newbyteorder("="))
+        stored = file.read_rows(offset + y0 * width * pixel, width * pixel, y1 - y0, x0 * pixel, x1 * pixel)
+    values: Array = stored.view(dtype).reshape(y1 - y0, x1 - x0, samples)
+    return values.astype(dtype.newbyteorder("="), copy=False)
 
 
-def _decoded_window(file: BinaryIO, page: TiffImage, box: tuple[int, int, int, int], samples: tuple[int, ...]) -> Array:
+def _decoded_window(file: OpenFile, page: TiffImage, box: Box, samples: tuple[int, ...]) -> Array:
     """Window put together from the strips or tiles that it touches."""
     y0, y1, x0, x1 = box
     height, width = page.segment_shape
     rows, columns = segment_grid(page)
-    assert page.decode is not None, "plain data are mapped"
+    assert page.decode is not None, "plain data are not decoded"
     out: Array | None = None
     for plane, into in [(k, [i]) for i, k in enumerate(samples)] if page.separate else [(0, list(range(len(samples))))]:
         for row in range(y0 // height, -(-y1 // height)):
             for column in range(x0 // width, -(-x1 // width)):
                 index = plane * rows * columns + row * columns + column
                 with span("read"):
-                    file.seek(page.offsets[index])
-                    stored = file.read(page.counts[index])
-                decoded, _, _ = page.decode(stored, index, jpegtables=page.jpegtables)
-                if decoded is None:
-                    raise ValueError(f"strip or tile {index} is empty")
-                tile = decoded[0]
+                    stored = file.read(page.offsets[index], page.counts[index])
+                tile = page.decode(stored, index)
                 if out is None:
-                    out = np.empty((y1 - y0, x1 - x0, len(samples)), np.uint8 if tile.dtype.kind == "b" else tile.dtype)
+                    out = np.empty((y1 - y0, x1 - x0, len(samples)), tile.dtype)
                 top, left = row * height, column * width
                 ya, yb = max(y0, top), min(y1, top + height)
                 xa, xb = max(x0, left), min(x1, left + width)
@@ -96,11 +105,3 @@ def _orient(image: Array, orientation: int) -> Array:
     if orientation in (2, 3, 6, 7):
         image = image[:, ::-1]
     return image
-
-
-def _has_imagecodecs() -> bool:
-    try:
-        import imagecodecs  # noqa: F401
-    except ImportError:
-        return False
-    return True

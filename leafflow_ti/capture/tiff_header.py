@@ -5,16 +5,17 @@ other files that spread a series over several files are read as what each file i
 
 * MINISWHITE is inverted (white becomes the largest value), palettes give the 8-bit colours (the upper byte of the
   16-bit colour map, as libtiff does), the orientation tag is applied.
-* Refused: complex, 64-bit integer and mixed-depth samples, CMYK, CIELab, raw mosaics, YCbCr outside JPEG, volumes.
+* Refused: complex, 64-bit integer and mixed-depth samples, CMYK, CIELab, raw mosaics, YCbCr outside JPEG, volumes;
+  what is stated beyond what the file's bytes can hold.
 """
 
 from __future__ import annotations
 
 import functools
 import logging
-import struct
+import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,13 +25,30 @@ import numpy as np
 import tifffile
 
 from leafflow_ti.capture.channels import Array, Colour, ImageInfo, check_size
+from leafflow_ti.capture.stored import StoredFile, one_line
+from leafflow_ti.capture.tiff_segments import (
+    MAX_SEGMENT_BYTES,
+    PICTURES,
+    PREDICTED,
+    READ,
+    Decode,
+    Shapes,
+    decoder,
+    greatest_ratio,
+    packed_row,
+    segment_bytes,
+    stored_limit,
+)
+from leafflow_ti.capture.tiff_structure import MAX_VALUES, check_structure
 from leafflow_ti.errors import InputError, LeafflowError
 
 _MINISWHITE, _MINISBLACK, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _JPEG = 7
+_PHOTOMETRIC, _STRIPS, _TILES = 262, 273, 324
 _REFUSED_COLOURS = {4: "a mask", 5: "CMYK", 6: "YCbCr without JPEG", 8: "CIELab", 32803: "a raw colour mosaic"}
 _ALPHA = (1, 2)  # associated, unassociated
 _SEPARATE = 2
+_FLOAT, _FLOAT_PREDICTORS = 3, (3, 34894, 34895)
 STRIPS = 4
 """Compressed strips in an image from which on a window decodes those that it touches, not all of them."""
 
@@ -61,8 +79,7 @@ class TiffImage:
     info: ImageInfo
     offsets: tuple[int, ...]
     counts: tuple[int, ...]
-    decode: Callable[..., tuple[Array | None, Any, Any]] | None  # None for a plain block, which needs no decoder
-    jpegtables: bytes | None
+    decode: Decode | None  # None for a plain block, which needs no decoder
     palette: Array | None  # [3, 2**bits] uint8
     stored_shape: tuple[int, int]  # height, width before the orientation is applied
     stored_samples: int
@@ -77,46 +94,32 @@ Pages = tuple[TiffImage | InputError, ...]
 
 
 @functools.lru_cache(maxsize=4096)
-def _pages(path: Path, _size: int, _mtime_ns: int) -> tuple[Pages, tuple[int, ...]]:
+def pages_of(stored: StoredFile) -> tuple[Pages, tuple[int, ...]]:
     """All pages (a page that cannot be read stands as its error), and the sizes of the stack's axes."""
+    path, size = stored.path, stored.size
     try:
-        _check_chain(path, _size)
-        with quiet(), tifffile.TiffFile(path) as tif:
-            found = [page for page in tif.pages if isinstance(page, tifffile.TiffPage)]
-            kept = [page for page in found if not page.subfiletype & 0b101] or found
-            if not kept:
-                raise InputError(f"{path}: TIFF without an image: write the file again")
-            pages = tuple(_page_or_error(path, page, _size) for page in kept)
-            count, shape = _stack(tif, kept)
+        with quiet(), stored.open() as file:
+            headers = check_structure(stored, file)
+            file.handle.seek(0)
+            with tifffile.TiffFile(file.handle, name=path.name) as tif:
+                if len(tif.pages) < headers:
+                    raise InputError(f"{path}: page {len(tif.pages)} has a damaged header: write the file again")
+                found = [page for page in tif.pages if isinstance(page, tifffile.TiffPage)]
+                kept = [page for page in found if not page.subfiletype & 0b101] or found
+                if not kept:
+                    raise InputError(f"{path}: TIFF without an image: write the file again")
+                pages = tuple(_page_or_error(path, page, size) for page in kept)
+                count, shape = _stack(path, tif, kept)
     except LeafflowError:
         raise
     except Exception as error:
         raise InputError(f"{path}: damaged TIFF header ({one_line(error)}): write the file again") from error
     if count > len(pages):
-        pages = _virtual_pages(path, pages[0], count, _size)
+        pages = _virtual_pages(path, pages[0], count, size)
     return pages, shape
 
 
-def _check_chain(path: Path, size: int) -> None:
-    """Walk from header to header: a chain that leaves the file or bites its tail would lose pages or never end."""
-    with path.open("rb") as file:
-        head = file.read(16)
-        order = "<" if head[:2] == b"II" else ">"
-        big = head[2:4] in (b"+\0", b"\0+")
-        count_format, pointer_format, entry = (order + "Q", order + "Q", 20) if big else (order + "H", order + "I", 12)
-        (offset,) = struct.unpack_from(pointer_format, head, 8 if big else 4)
-        seen: set[int] = set()
-        while offset:
-            if offset in seen or offset >= size:
-                raise InputError(f"{path}: page {len(seen)} has its header at byte {offset}: damaged, write it again")
-            seen.add(offset)
-            file.seek(offset)
-            (entries,) = struct.unpack(count_format, file.read(struct.calcsize(count_format)))
-            file.seek(entries * entry, 1)
-            (offset,) = struct.unpack(pointer_format, file.read(struct.calcsize(pointer_format)))
-
-
-def _stack(tif: tifffile.TiffFile, kept: list[tifffile.TiffPage]) -> tuple[int, tuple[int, ...]]:
+def _stack(path: Path, tif: tifffile.TiffFile, kept: list[tifffile.TiffPage]) -> tuple[int, tuple[int, ...]]:
     """Number of pages and sizes of the stack's axes; ImageJ, tifffile and STK may store many behind one header."""
     n = len(kept)
     # Series of these kinds may pull in other files, or order pages by metadata: their own pages are all we take.
@@ -124,14 +127,24 @@ def _stack(tif: tifffile.TiffFile, kept: list[tifffile.TiffPage]) -> tuple[int, 
         return n, (n,)
     if not (tif.is_shaped or tif.is_imagej or tif.is_stk) or len(tif.series) != 1:
         return n, (n,)
+    if tif.is_imagej and n == 1:
+        _check_imagej_length(path, tif, kept[0])
     series = tif.series[0]
     shape = tuple(
         size for size, axis in zip(series.shape, series.axes, strict=True) if axis not in "YXS" and size > 1
     ) or (1,)
-    count = int(np.prod(shape))
+    count = math.prod(shape)
     if n == 1 or count == n:
         return count, shape
     return n, (n,)
+
+
+def _check_imagej_length(path: Path, tif: tifffile.TiffFile, page: tifffile.TiffPage) -> None:
+    """One header for a stack: where the file ends before the last image, tifffile takes the first one for all."""
+    said = tif.imagej_metadata or {}
+    count = math.prod(max(1, int(said.get(name, 1))) for name in ("slices", "frames"))
+    if page.dataoffsets and page.dataoffsets[0] + count * page.nbytes > tif.filehandle.size:
+        raise InputError(f"{path}: header states {count} images, the file ends before: copy or write it again")
 
 
 def _virtual_pages(path: Path, first: TiffImage | InputError, count: int, size: int) -> Pages:
@@ -143,6 +156,8 @@ def _virtual_pages(path: Path, first: TiffImage | InputError, count: int, size: 
     step = first.contiguous.itemsize * first.stored_samples * first.stored_shape[0] * first.stored_shape[1]
     if first.offsets[0] + count * step > size:
         raise InputError(f"{path}: header states {count} images, the file ends before: copy or write it again")
+    if count > MAX_VALUES:
+        raise InputError(f"{path}: {count} images behind one header, more than {MAX_VALUES}: split the stack")
     return tuple(replace(first, offsets=(first.offsets[0] + k * step,), counts=(step,)) for k in range(count))
 
 
@@ -162,6 +177,8 @@ def _page(path: Path, page: tifffile.TiffPage, size: int) -> TiffImage:
     check_size(path, height, width)
     if page.imagedepth != 1:
         raise InputError(f"{name}: a volume of depth {page.imagedepth} in one page: save one page per slice")
+    if samples < 1:
+        raise InputError(f"{name}: {samples} samples per pixel: damaged file, write it again")
     dtype = page.dtype
     if dtype is None or dtype.kind not in "buif" or (dtype.kind in "ui" and dtype.itemsize > 4):
         raise InputError(
@@ -182,8 +199,14 @@ def _page(path: Path, page: tifffile.TiffPage, size: int) -> TiffImage:
     segment = (page.tilelength, page.tilewidth) if page.is_tiled else (min(page.rowsperstrip, height), width)
     if min(segment) < 1 or segment[0] * segment[1] > 2 * max(height * width, 2**24):
         raise InputError(f"{name}: strips or tiles of {segment[0]} x {segment[1]}: damaged file, write it again")
+    if _STRIPS in page.tags and _TILES in page.tags:
+        raise InputError(f"{name}: strips as well as tiles: which hold the image is not stated, write the file again")
+    if page.compression not in READ:
+        raise InputError(f"{name}: compression {int(page.compression)} is not read: save with LZW, Deflate or ZSTD")
+    _check_predictor(name, page)
     separate = page.planarconfig == _SEPARATE and samples > 1
     plain = page.is_final
+    shapes = functools.partial(_segment_shapes, (height, width), segment, page.is_tiled)
     result = TiffImage(
         info=ImageInfo(
             height=width if orientation > 4 else height,
@@ -196,8 +219,7 @@ def _page(path: Path, page: tifffile.TiffPage, size: int) -> TiffImage:
         ),
         offsets=tuple(page.dataoffsets),
         counts=tuple(page.databytecounts),
-        decode=None if plain else page.decode,
-        jpegtables=page.jpegtables,
+        decode=None if plain else decoder(page, shapes, 1 if separate else samples),
         palette=palette,
         stored_shape=(height, width),
         stored_samples=samples,
@@ -207,13 +229,15 @@ def _page(path: Path, page: tifffile.TiffPage, size: int) -> TiffImage:
         inverted=inverted,
         orientation=orientation,
     )
-    _check_segments(name, result, size)
+    _check_segments(name, page, result, shapes, size)
     return result
 
 
 def _colour(name: str, page: tifffile.TiffPage) -> tuple[Colour, int]:
     """Meaning and number of the samples that a reader of this page sees."""
     samples, kind = page.samplesperpixel, page.photometric
+    if _PHOTOMETRIC not in page.tags:
+        raise InputError(f"{name}: not stated whether black or white is zero (entry 262): write the file again")
     if kind == _PALETTE and samples == 1:
         return "rgb", 3
     if (kind == _RGB and samples >= 3) or (kind == _YCBCR and samples == 3 and page.compression == _JPEG):
@@ -233,22 +257,69 @@ def _palette(name: str, page: tifffile.TiffPage) -> Array:
     return np.asarray(table if table.max() < 256 else table >> 8, np.uint8)
 
 
-def _check_segments(name: str, page: TiffImage, size: int) -> None:
-    """Every strip or tile must exist and end inside the file."""
-    rows, columns = segment_grid(page)
-    needed = rows * columns * (page.stored_samples if page.separate else 1)
-    if len(page.offsets) < needed or len(page.counts) < needed:
-        raise InputError(f"{name}: {len(page.offsets)} of {needed} strips or tiles listed: truncated, write it again")
-    for offset, count in zip(page.offsets[:needed], page.counts[:needed], strict=True):
+def _check_predictor(name: str, page: tifffile.TiffPage) -> None:
+    """Readers disagree on predictors where the standard has none: some apply them, some do not."""
+    predictor, compression = int(page.predictor), int(page.compression)
+    applied = compression in PREDICTED and (predictor not in _FLOAT_PREDICTORS or page.sampleformat == _FLOAT)
+    if predictor != 1 and compression not in PICTURES and not applied:
+        raise InputError(
+            f"{name}: predictor {predictor} for samples of format {int(page.sampleformat)} with compression "
+            f"{compression} has no meaning: damaged, write it again"
+        )
+
+
+def _check_segments(name: str, page: tifffile.TiffPage, result: TiffImage, shapes: Shapes, size: int) -> None:
+    """Every strip or tile must be listed, end inside the file, and be able to hold the samples that are stated."""
+    rows, columns = segment_grid(result)
+    needed = rows * columns * (result.stored_samples if result.separate else 1)
+    lsm = page.parent.is_lsm  # its strips are not always those of one page; tifffile sorts them out
+    listed = len(result.offsets) if lsm else page.tags[_TILES if page.is_tiled else _STRIPS].count
+    if listed != needed or min(len(result.offsets), len(result.counts)) < needed:
+        raise InputError(f"{name}: {listed} strips or tiles listed, {needed} needed: damaged, write it again")
+    for offset, count in zip(result.offsets, result.counts, strict=False):
         if offset <= 0 or count <= 0:
             raise InputError(f"{name}: a strip or tile without data: sparse or truncated file, write it again")
         if offset + count > size:
             raise InputError(f"{name}: data end at byte {offset + count}, the file at {size}: truncated, copy it again")
-    if page.contiguous is not None:
-        height, width = page.stored_shape
-        end = page.offsets[0] + height * width * page.stored_samples * page.contiguous.itemsize
-        if end > size:
-            raise InputError(f"{name}: data end at byte {end}, the file at {size}: truncated, copy it again")
+    if result.contiguous is None:
+        _check_plausible(name, page, result, shapes, size)
+        return
+    height, width = result.stored_shape
+    row = width * result.stored_samples * result.contiguous.itemsize
+    if (end := result.offsets[0] + height * row) > size:
+        raise InputError(f"{name}: data end at byte {end}, the file at {size}: truncated, copy it again")
+    if not 0 <= (stored := sum(result.counts)) - height * row < row and not lsm:
+        raise InputError(f"{name}: {stored} bytes for {height} rows of {row}: damaged file, write it again")
+
+
+def _check_plausible(name: str, page: tifffile.TiffPage, result: TiffImage, shapes: Shapes, size: int) -> None:
+    """The bytes of every strip or tile must be able to hold its samples, all together those of the file."""
+    samples, bits = 1 if result.separate else result.stored_samples, int(page.bitspersample)
+    whole = segment_bytes(page)
+    if whole > MAX_SEGMENT_BYTES:
+        raise InputError(f"{name}: a strip or tile of {whole} bytes, more than {MAX_SEGMENT_BYTES}: save smaller ones")
+    compression = int(page.compression)
+    most = stored_limit(compression, whole, packed_row(result.segment_shape[1] * samples, bits))
+    for index, count in enumerate(result.counts):
+        height, width = min(shapes(index))
+        least = height * packed_row(width * samples, bits) / greatest_ratio(compression)
+        if not least <= count <= most:
+            raise InputError(
+                f"{name}: strip or tile {index} of {count} bytes for {height} x {width} pixels cannot be: "
+                "damaged file, write it again"
+            )
+    if sum(result.counts) > 16 * size:
+        raise InputError(f"{name}: strips or tiles overlap: damaged file, write it again")
+
+
+def _segment_shapes(
+    image: tuple[int, int], segment: tuple[int, int], tiled: bool, index: int
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Rows and columns that a segment may have: as writers should store those at the lower and right edge, and not."""
+    down, across = -(-image[0] // segment[0]), -(-image[1] // segment[1])
+    row, column = divmod(index % (down * across), across)
+    inside = min(segment[0], image[0] - row * segment[0]), min(segment[1], image[1] - column * segment[1])
+    return (segment, inside) if tiled else (inside, segment)
 
 
 def segment_grid(page: TiffImage) -> tuple[int, int]:
@@ -257,15 +328,9 @@ def segment_grid(page: TiffImage) -> tuple[int, int]:
     return -(-height // rows), -(-width // columns)
 
 
-def pages_of(path: Path) -> tuple[Pages, tuple[int, ...]]:
-    """Pages of the file as it is now (headers are cached until size or time of the file change)."""
-    stat = path.stat()
-    return _pages(path, stat.st_size, stat.st_mtime_ns)
-
-
-def probe(path: Path) -> ImageInfo:
+def probe(stored: StoredFile) -> ImageInfo:
     """Header of the first page, number of pages, and whether the others are like it."""
-    pages, shape = pages_of(path)
+    pages, shape = pages_of(stored)
     first = pages[0]
     if isinstance(first, InputError):
         raise first
@@ -289,17 +354,12 @@ def _describe(info: ImageInfo) -> str:
     return f"{info.height} x {info.width} {info.colour} with {info.samples} samples of {info.bits} bit"
 
 
-def page_at(path: Path, page: int) -> TiffImage:
+def page_at(stored: StoredFile, page: int) -> TiffImage:
     """One page, from 0; raises InputError if it does not exist or is of a kind that is not read."""
-    pages, _ = pages_of(path)
+    pages, _ = pages_of(stored)
     if not 0 <= page < len(pages):
-        raise InputError(f"{path}: no page {page}, the file holds pages 0 to {len(pages) - 1}")
+        raise InputError(f"{stored.path}: no page {page}, the file holds pages 0 to {len(pages) - 1}")
     found = pages[page]
     if isinstance(found, InputError):
         raise found
     return found
-
-
-def one_line(error: BaseException) -> str:
-    """Text of an error without line breaks, or its kind if it has none."""
-    return " ".join(str(error).split()) or type(error).__name__

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from leafflow_ti.cli.options import Outside
+
 if TYPE_CHECKING:
     from leafflow_ti.inspection_report import CameraCheck, Report
 
@@ -17,15 +19,17 @@ PROBLEMS = 4
 
 def check(
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="capture.toml, or the folder that holds it.")],
+    outside: Outside = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Estimate position errors of the cameras, brightness, noise, saturation, texture, disparities and motions.
 
     Says what will not work and what to change. Exit code 0: fine, or hints only; 4: problems.
     """
+    from leafflow_ti.capture import open_capture
     from leafflow_ti.inspection import check as look
 
-    found = look(capture)
+    found = look(open_capture(capture, outside=outside))
     typer.echo(json.dumps(found.to_json(), indent=2) if as_json else "\n".join(format_report(found)))
     if not found.fine:
         raise typer.Exit(PROBLEMS)

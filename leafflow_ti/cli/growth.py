@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from leafflow_ti.cli.log import with_log_file
 from leafflow_ti.cli.progress import counted
+from leafflow_ti.errors import Interrupted
 
 if TYPE_CHECKING:
     from leafflow_ti.surface_growth import GrowthSummary
@@ -17,6 +19,7 @@ DISAGREEMENT = 2.0
 """Root mean square of (growth_rate - area_rate) / standard error beyond which advice is given."""
 
 
+@with_log_file
 def growth(
     result: Annotated[Path, typer.Argument(metavar="OUT.zarr", help="Results of 'leafflow-ti run'.")],
     strain_window: Annotated[
@@ -47,9 +50,9 @@ def growth(
 
     try:
         summary = measure_growth(result, strain_window, average, counted("frame"))
-    except KeyboardInterrupt:
-        typer.echo("interrupted: maps that are not whole are left out until the same command has run again", err=True)
-        raise
+    except KeyboardInterrupt as interrupt:
+        advice = "maps that are not whole are left out until the same command has run again"
+        raise Interrupted.advised(interrupt, advice) from None
     if as_json:
         typer.echo(json.dumps(summary.to_json(), indent=2, ensure_ascii=False))
     else:

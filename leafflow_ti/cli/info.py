@@ -3,41 +3,67 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from leafflow_ti.cli.progress import format_rate
-from leafflow_ti.cli.run import format_status
-from leafflow_ti.errors import InputError
+from leafflow_ti.cli.info_store import damage_lines, store_facts, store_lines
+from leafflow_ti.cli.options import Outside
+from leafflow_ti.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from leafflow_ti.capture import FileCapture
     from leafflow_ti.results import ResultStore
 
-LISTED = 9
-"""Most numbers of a list that are printed."""
-
 
 def info(
     path: Annotated[Path, typer.Argument(metavar="CAPTURE|OUT.zarr", help="A capture.toml or its folder, or results.")],
+    outside: Outside = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Read every file of a results store: is it whole?")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Say what a capture, or a results store, is."""
-    if not path.exists():
+    """Say what a capture, or a results store, is: how it came about, and what is missing and why."""
+    from leafflow_ti.unit_marks import FOLDER
+
+    if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises for names that are too long
         raise InputError(f"{path}: does not exist; give a capture.toml, a folder that holds one, or an OUT.zarr")
-    if (path / "zarr.json").is_file():
+    if (path / "zarr.json").is_file() or (path / FOLDER).is_dir():
         from leafflow_ti.results import ResultStore
 
-        facts = store_facts(ResultStore.open(path))
-        lines = _store_lines(facts)
+        store = ResultStore.open(path)
+        if verify:
+            check_files(store, as_json)
+        facts = store_facts(store) | ({"damaged": []} if verify else {})
+        lines = store_lines(facts)
+    elif verify:
+        raise UsageError(f"--verify reads the files of a results store; {path} is none")
     else:
         from leafflow_ti.capture import open_capture
 
-        facts = capture_facts(open_capture(path))
-        lines = _capture_lines(facts)
+        facts = capture_facts(open_capture(path, outside=outside))
+        lines = [*_capture_lines(facts), *(f"warning      {doubt}" for doubt in facts["warnings"])]
     typer.echo(json.dumps(facts, indent=2, ensure_ascii=False) if as_json else "\n".join(lines))
+
+
+def check_files(store: ResultStore, as_json: bool) -> None:
+    """Read all files of a store; prints those that are damaged and raises InputError, if there are any."""
+    from leafflow_ti.store_check import damaged
+
+    found = damaged(store)
+    if not found:
+        return
+    if as_json:
+        facts = {"path": str(store.path), "damaged": [damage.to_json() for damage in found]}
+        typer.echo(json.dumps(facts, indent=2, ensure_ascii=False))
+    else:
+        typer.echo("\n".join(damage_lines(found)))
+    units = len({damage.unit for damage in found})
+    raise InputError(
+        f"{store.path}: {units} of {store.n_units} units are damaged; 'run --resume --verify' with the same capture "
+        "and options computes them again"
+    )
 
 
 def capture_facts(capture: FileCapture) -> dict[str, Any]:
@@ -81,7 +107,17 @@ def capture_facts(capture: FileCapture) -> dict[str, Any]:
             facts["geometry"]["largest_deviation_mm"] = _largest_deviation(capture)
         if capture.n_rows * capture.n_cols > 1:
             facts["working_distance"] = _working_distance(capture)
+    facts["warnings"] = _doubts(capture, facts["working_distance"])
     return facts
+
+
+def _doubts(capture: FileCapture, distance: dict[str, Any] | None) -> list[str]:
+    """What a run would warn of, and a depth that can hardly be meant."""
+    from leafflow_ti.capture import capture_doubts
+    from leafflow_ti.capture.plausibility import depth_doubts
+
+    seen = distance["preshift_px"] if distance else None
+    return [*capture_doubts(capture), *(depth_doubts(capture, (seen[0], seen[1])) if seen else ())]
 
 
 def _largest_deviation(capture: FileCapture) -> dict[str, Any]:
@@ -186,105 +222,3 @@ def _capture_lines(facts: dict[str, Any]) -> list[str]:
 
 def _pair(values: list[float]) -> str:
     return ", ".join(f"{value:g}" for value in values)
-
-
-def _range(ends: list[int]) -> str:
-    return f"{ends[0]} to {ends[1]}"
-
-
-def store_facts(store: ResultStore) -> dict[str, Any]:
-    """Extent, attributes, statuses of all frames, and unit and range of each map in the middle frame."""
-    import numpy as np
-
-    from leafflow_ti.field import quantity, status_counts
-
-    middle = len(store.frames) // 2
-    maps: dict[str, Any] = {}
-    for name in store.names:
-        values = store.read(name, middle)
-        finite = values[np.isfinite(values)]
-        low, median, high = (float(v) for v in np.percentile(finite, (0, 50, 100))) if finite.size else (None,) * 3
-        maps[name] = {"units": quantity(name)[0], "min": low, "median": median, "max": high}
-    counts: dict[str, int] = {}
-    for t_index in range(len(store.frames)):
-        for name, n in status_counts(store.read("status", t_index)).items():
-            counts[name] = counts.get(name, 0) + n
-    return {
-        "path": str(store.path),
-        "frames": list(store.frames),
-        "rows": store.y.size,
-        "columns": store.x.size,
-        "x_px": [int(store.x[0]), int(store.x[-1])],
-        "y_px": [int(store.y[0]), int(store.y[-1])],
-        "interval_s": store.interval_s,
-        "units_done": len(store.done()),
-        "units": store.n_units,
-        "remarks": list(store.remarks),
-        "maps_of_frame": store.frames[middle],
-        "maps": maps,
-        "status": counts,
-        "attributes": store.attrs,
-    }
-
-
-def _store_lines(facts: dict[str, Any]) -> list[str]:
-    first, last = facts["frames"][0], facts["frames"][-1]
-    done, units = facts["units_done"], facts["units"]
-    lines = [
-        f"results      {facts['path']}",
-        f"frames       {len(facts['frames'])} ({_range([first, last])})",
-        f"maps         {facts['rows']} x {facts['columns']} (y, x), "
-        f"pixels x {_range(facts['x_px'])}, y {_range(facts['y_px'])}",
-        f"units        {done} of {units} done" + ("" if done == units else ": go on with run --resume"),
-        *(f"note         {remark}" for remark in facts["remarks"]),
-        *_timing_lines(facts["attributes"].get("timings")),
-        "",
-        f"status of the pixels of {'all frames' if len(facts['frames']) > 1 else 'the frame'}",
-        *format_status(facts["status"]),
-        "",
-        f"{'frame ' + str(facts['maps_of_frame']):<22} {'unit':<12} {'min':>12} {'median':>12} {'max':>12}",
-    ]
-    for name, row in facts["maps"].items():
-        numbers = " ".join(
-            f"{'-' if row[key] is None else format(row[key], '.6g'):>12}" for key in ("min", "median", "max")
-        )
-        lines.append(f"{name:<22} {row['units']:<12} {numbers}")
-    for key, value in facts["attributes"].items():
-        if key != "timings":
-            lines += ["", key, *_indented(value)]
-    return lines
-
-
-def _timing_lines(timings: dict[str, Any] | None) -> list[str]:
-    """What the units have cost so far, on the clock and by stage."""
-    if not timings:
-        return []
-    runs = "one run" if timings["runs"] == 1 else f"{timings['runs']} runs"
-    stages = ", ".join(f"{stage} {seconds:.4g} s" for stage, seconds in timings["stages"].items())
-    return [
-        f"time         {timings['seconds']:.4g} s in {runs} on {timings['device']}: {timings['units']} units, "
-        f"{format_rate(timings['pixels_per_second'])}",
-        f"stages       {stages} (reading, decoding and writing go on beside the rest)",
-    ]
-
-
-def _indented(value: object) -> list[str]:
-    """An attribute as indented lines: text as it is, tables key by key."""
-    if isinstance(value, dict):
-        return [
-            line
-            for key, inner in value.items()
-            for line in (
-                [f"  {key}", *(f"  {x}" for x in _indented(inner))]
-                if isinstance(inner, dict)
-                else [f"  {key}: {_brief(inner)}"]
-            )
-        ]
-    return [f"  {line}" for line in str(value).splitlines()]
-
-
-def _brief(value: object) -> object:
-    """A value of an attribute; of a long list the first numbers, --json has them all."""
-    if isinstance(value, list) and len(value) > LISTED:
-        return f"[{', '.join(str(one) for one in value[:LISTED])}, ... {len(value)} in all]"
-    return value

@@ -1,20 +1,16 @@
-"""The command line: one table of commands, each loaded when it is called, and one place where errors become exit codes.
+"""The command line: one table of commands, and one place where errors and signals become one line and an exit code.
 
-Codes: 0 ok, 2 usage, 3 configuration, 4 input, 5 device, 6 runtime, 7 partly done, 130 interrupted.
+Codes: 0 ok, 2 usage, 3 configuration, 4 input, 5 device, 6 runtime, 7 partly done, 130 interrupted, 143 terminated.
 """
 
 from __future__ import annotations
 
-import importlib
+import contextlib
 import os
 import sys
-from typing import Annotated, Any
 
-import typer
-from typer.core import TyperCommand, TyperGroup
-
-from leafflow_ti import __version__
-from leafflow_ti.errors import LeafflowError
+from leafflow_ti.errors import LeafflowError, one_line
+from leafflow_ti.stopping import stoppable
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": (
@@ -37,86 +33,52 @@ COMMANDS: dict[str, tuple[str, str]] = {
 """Command -> where it lives (module of this package:object) and its line in the help."""
 
 
-class _LazyGroup(TyperGroup):
-    """A group whose commands are placeholders with a line of help until one of them is called."""
-
-    def __init__(self, **attrs: Any) -> None:
-        super().__init__(**attrs)
-        for name, (_, line) in COMMANDS.items():
-            self.add_command(TyperCommand(name, help=line, short_help=line, rich_markup_mode=None))
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, placeholder, rest = super().resolve_command(ctx, args)
-        return name, placeholder if name is None else _load(name), rest
-
-
-def _load(name: str) -> Any:
-    module_name, _, attribute = COMMANDS[name][0].partition(":")
-    found = getattr(importlib.import_module(f"leafflow_ti.cli.{module_name}"), attribute)
-    if isinstance(found, typer.Typer):
-        app = found
-    else:
-        app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name, no_args_is_help=False)(found)
-    return typer.main.get_command(app)
-
-
-def _show_version(value: bool) -> None:
-    if value:
-        typer.echo(f"leafflow-ti {__version__}")
-        raise typer.Exit
-
-
-def _app() -> typer.Typer:
-    # Rich costs more than the rest of the start together, and completion adds two options to every help page.
-    app = typer.Typer(
-        cls=_LazyGroup,
-        name="leafflow-ti",
-        no_args_is_help=True,
-        add_completion=False,
-        rich_markup_mode=None,
-        pretty_exceptions_enable=False,
-        context_settings={"help_option_names": ["-h", "--help"]},
-        epilog="First look: leafflow-ti demo. Help on a command: leafflow-ti run --help.",
-    )
-
-    @app.callback()
-    def root(
-        version: Annotated[
-            bool, typer.Option("--version", help="Print the version and exit.", callback=_show_version, is_eager=True)
-        ] = False,
-    ) -> None:
-        """Dense depth, surface normals and 3D motion with error bars from camera-grid image sequences."""
-
-    return app
-
-
 def invoke(args: list[str]) -> None:
     """Run one command line in this process; errors are raised, not printed, and so is an exit code other than 0."""
-    code = _app()(args, prog_name="leafflow-ti", standalone_mode=False)
-    if code:
-        raise typer.Exit(code)
+    from leafflow_ti.cli import app
+
+    app.invoke(args)
 
 
 def main(args: list[str] | None = None) -> None:
     """Run the command line with ``args`` (default: those of the process); always ends in ``SystemExit``."""
-    try:
-        _app()(args, prog_name="leafflow-ti")
-    except LeafflowError as error:
-        _fail(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        _fail("interrupted", 130)
-    except Exception as error:
-        if os.environ.get("LEAFFLOW_TI_DEBUG") == "1":
-            raise
-        text = " ".join(str(error).split())
-        _fail(f"unexpected {type(error).__name__}: {text} (LEAFFLOW_TI_DEBUG=1 shows where; please report it)", 6)
+    _open_streams()
+    with stoppable(whole_process=args is None) as stop:  # before all that takes time to import
+        try:
+            from leafflow_ti.cli import app
+
+            app.run(args)
+        except BaseException as error:
+            # Foreign code may have made another error of an interrupt, or of the error that followed it.
+            if stop.number is not None and not isinstance(error, KeyboardInterrupt):
+                error = stop.interrupt()
+            if isinstance(error, SystemExit):
+                raise
+            if not isinstance(error, LeafflowError | KeyboardInterrupt) and os.environ.get("LEAFFLOW_TI_DEBUG") == "1":
+                raise
+            message, code = one_line(error)
+            _say(f"error: {message}")
+            if args is None and isinstance(error, KeyboardInterrupt):
+                os._exit(code)  # the engine's own end can take ten seconds when it is cut short
+            sys.exit(code)
 
 
-def _fail(message: str, code: int) -> None:
-    sys.stdout.flush()
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(code)
+def _open_streams() -> None:
+    """Streams that whoever started this process has closed lead nowhere."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - until the end
+
+
+def _say(line: str) -> None:
+    """Print the last line, after all that was written before."""
+    from leafflow_ti.cli.progress import end_line
+
+    with contextlib.suppress(OSError):  # nobody reads it any more, or it is full: that may be the very error
+        sys.stdout.flush()
+    with contextlib.suppress(OSError):
+        end_line()
+        print(line, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

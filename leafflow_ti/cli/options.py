@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -150,7 +150,12 @@ MotionRange = Annotated[
 Precision = Annotated[str | None, _text("precision", "f32|f64", "Floating-point numbers of the kernels [f32].")]
 Arch = Annotated[str | None, _text("arch", "auto|cpu|cuda|vulkan|metal", "Device [auto].")]
 MaxMemory = Annotated[str | None, _text("max-memory", "SIZE", "Limit such as 8G [half of the machine's memory].")]
-Threads = Annotated[str | None, _text("threads", "auto|N", "CPU threads [auto].")]
+Threads = Annotated[str | None, _text("threads", "auto|N", "CPU threads of a process [auto].")]
+Workers = Annotated[str | None, _text("workers", "N", "Processes that share the work [1].")]
+
+Outside = Annotated[
+    bool, typer.Option("--outside", help="Allow a capture.toml that names files outside its own folder.")
+]
 
 Config = Annotated[Path | None, _text("config", "run.toml", "Configuration file.")]
 Sets = Annotated[
@@ -166,7 +171,7 @@ SETTINGS: dict[str, Any] = {
     "blur": Blur, "blur_time": BlurTime, "prefilter": Prefilter,
     "sigma_pre": SigmaPre, "frames": Frames, "roi": Roi, "mask": Mask, "preshift": Preshift,
     "disparity_range": DisparityRange, "motion_range": MotionRange,
-    "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads,
+    "precision": Precision, "arch": Arch, "max_memory": MaxMemory, "threads": Threads, "workers": Workers,
 }  # fmt: skip
 """Keyword of the configuration -> its option."""
 
@@ -192,14 +197,25 @@ def with_settings(without: tuple[str, ...] = ()) -> Callable[[Callable[..., None
 
             command(**values, settings=settings)
 
-        # The command line is made from the signature.
-        own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name != "settings"]
-        added = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
-                 for name, kind in kinds.items()]  # fmt: skip
-        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + added
-        del wrapper.__wrapped__
-        wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
-        return wrapper
+        own = (p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name != "settings")
+        return with_parameters(wrapper, own, kinds)
 
     return decorate
+
+
+def with_parameters(
+    wrapper: Callable[..., None], own: Iterable[inspect.Parameter], added: Mapping[str, Any]
+) -> Callable[..., None]:
+    """The wrapper of a command, called with the command's ``own`` parameters and the ``added`` ones: name -> option.
+
+    The command line is made from the signature.
+    """
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    parameters = [
+        *(p.replace(kind=keyword) for p in own),
+        *(inspect.Parameter(name, keyword, default=None, annotation=kind) for name, kind in added.items()),
+    ]
+    del wrapper.__wrapped__  # type: ignore[attr-defined]
+    wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
+    return wrapper

@@ -24,7 +24,7 @@ def _number(name: str, metavar: str, help: str) -> Any:
     return typer.Option(name, metavar=metavar, help=help, show_default=False)
 
 
-@options.with_settings(without=("noise", "frames", "roi", "mask", "depth", "max_memory", "threads"))
+@options.with_settings(without=("noise", "frames", "roi", "mask", "depth", "max_memory", "threads", "workers"))
 def plan_rig(
     settings: Callable[..., Any],
     distance: Annotated[float, _number("--distance", "MM", "Distance of the surface.")],

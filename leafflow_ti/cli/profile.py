@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from leafflow_ti.profile_report import Profile, StageCost
 
 
-@options.with_settings(without=("frames",))
+@options.with_settings(without=("frames", "workers"))
 def profile(
     settings: Callable[..., Any],
     capture: Annotated[
@@ -42,6 +42,7 @@ def profile(
             "--trace", metavar="FILE", help="Write a trace for Perfetto or about:tracing.", show_default=False
         ),
     ] = None,
+    outside: options.Outside = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Measure the stages of a run on a few frames, and say how long the whole will take.
@@ -54,7 +55,7 @@ def profile(
         configuration = settings()
         from leafflow_ti.capture import open_capture
 
-        opened: Any = open_capture(capture)
+        opened: Any = open_capture(capture, outside=outside)
     else:
         from leafflow_ti.profile_cases import find_case
 

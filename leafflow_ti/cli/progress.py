@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable
-from typing import TextIO
+from typing import ClassVar, TextIO
 
 from leafflow_ti.number_text import duration
 from leafflow_ti.progress import Progress
@@ -31,14 +32,68 @@ def format_progress(progress: Progress) -> str:
     return ", ".join(parts)
 
 
+class RewrittenLine:
+    """A line of a terminal that is written again and again until it is closed."""
+
+    _open: ClassVar[RewrittenLine | None] = None
+    _lock: ClassVar[threading.RLock] = threading.RLock()  # warnings come from any thread
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._text = ""
+
+    def show(self, text: str) -> None:
+        """Write this in place of what is there."""
+        with self._lock:
+            self._stream.write("\r" + text.ljust(len(self._text)))
+            self._stream.flush()
+            self._text = text
+            RewrittenLine._open = self
+
+    def close(self) -> None:
+        """Leave the line as it is and go to the next one."""
+        with self._lock:
+            if self._text:
+                self._stream.write("\n")
+                self._stream.flush()
+                self._text = ""
+                RewrittenLine._open = None
+
+    @classmethod
+    def beside(cls, line: str, stream: TextIO) -> None:
+        """Write a line of its own; the rewritten line, if there is one, goes on below it."""
+        with cls._lock:
+            rewritten = cls._open
+            if rewritten:
+                rewritten._stream.write("\r" + " " * len(rewritten._text) + "\r")
+                rewritten._stream.flush()
+            stream.write(line + "\n")
+            stream.flush()
+            if rewritten:
+                rewritten.show(rewritten._text)
+
+
+def end_line() -> None:
+    """Leave the line that shows progress, if there is one, and go to the next one."""
+    if RewrittenLine._open:
+        RewrittenLine._open.close()
+
+
+def write_line(text: str) -> None:
+    """Write a line to standard error, never into the midst of one that shows progress."""
+    RewrittenLine.beside(text, sys.stderr)
+
+
 def counted(what: str) -> Callable[[int, int], None] | None:
     """Shows ``image 3/12`` on standard error, rewritten, where that is a terminal; None elsewhere."""
     if not sys.stderr.isatty():
         return None
+    line = RewrittenLine(sys.stderr)
 
     def show(done: int, total: int) -> None:
-        sys.stderr.write(f"\r{what} {done}/{total}" + ("\n" if done == total else ""))
-        sys.stderr.flush()
+        line.show(f"{what} {done}/{total}")
+        if done == total:
+            line.close()
 
     return show
 
@@ -51,10 +106,9 @@ class ProgressLine:
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = sys.stderr if stream is None else stream
-        self._terminal = self._stream.isatty()
-        self._interval = TERMINAL_INTERVAL_S if self._terminal else LOG_INTERVAL_S
+        self._line = RewrittenLine(self._stream) if self._stream.isatty() else None
+        self._interval = TERMINAL_INTERVAL_S if self._line else LOG_INTERVAL_S
         self._next = 0.0
-        self._width = 0
 
     def __call__(self, progress: Progress) -> None:
         now = time.monotonic()
@@ -62,16 +116,13 @@ class ProgressLine:
             return
         self._next = now + self._interval
         text = format_progress(progress)
-        if self._terminal:
-            self._stream.write("\r" + text.ljust(self._width))
-            self._width = len(text)
+        if self._line:
+            self._line.show(text)
         else:
             self._stream.write(text + "\n")
-        self._stream.flush()
+            self._stream.flush()
 
     def close(self) -> None:
         """Leave the line as it is and go to the next one."""
-        if self._terminal and self._width:
-            self._stream.write("\n")
-            self._stream.flush()
-            self._width = 0
+        if self._line:
+            self._line.close()

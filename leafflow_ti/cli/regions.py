@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from leafflow_ti.cli.log import with_log_file
 from leafflow_ti.errors import UsageError
 
 
@@ -15,6 +16,7 @@ def _option(name: str, metavar: str, help: str) -> typer.models.OptionInfo:
     return found
 
 
+@with_log_file
 def regions(
     result: Annotated[Path, typer.Argument(metavar="OUT.zarr", help="Results of 'leafflow-ti run'.")],
     labels: Annotated[Path, _option("labels", "FILE", "Label image (TIFF, PNG) of the images' size, 0 for none.")],

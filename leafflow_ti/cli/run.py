@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from leafflow_ti.cli import options
-from leafflow_ti.cli.progress import ProgressLine
-from leafflow_ti.errors import UsageError
+from leafflow_ti.cli.log import with_log_file
+from leafflow_ti.cli.progress import ProgressLine, write_line
+from leafflow_ti.errors import Interrupted, UsageError
 from leafflow_ti.number_text import duration
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 
 @options.with_settings()
+@with_log_file
 def run(
     settings: Callable[[], Any],
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="capture.toml, or the folder that holds it.")],
@@ -27,6 +30,37 @@ def run(
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="With --resume: compute what is damaged again, all files are read.")
+    ] = False,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            "--shard", metavar="K/N", help="Only the K-th of N parts, for one job of an array.", show_default=False
+        ),
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(
+            "--dask",
+            metavar="ADDRESS|local",
+            help="Compute on the Dask cluster of a scheduler, or on a local one of --workers processes.",
+            show_default=False,
+        ),
+    ] = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Measure the frames of a capture as they arrive, until none does any more.")
+    ] = False,
+    follow_timeout: Annotated[
+        float | None,
+        typer.Option(
+            "--follow-timeout",
+            metavar="SECONDS",
+            min=0,
+            help="How long to wait for what arrives next [10 intervals, 60 at least; 600 without an interval].",
+            show_default=False,
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing results store.")] = False,
     quicklook: Annotated[
         bool | None,
@@ -36,7 +70,8 @@ def run(
             show_default=False,
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    outside: options.Outside = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print warnings and errors only.")] = False,
 ) -> None:
     """Measure depth, normals and 3D motion of a capture.
 
@@ -45,32 +80,58 @@ def run(
     configuration = settings()
     if resume and overwrite:
         raise UsageError("--resume and --overwrite exclude each other: give the one that is meant")
+    if verify and not resume:
+        raise UsageError("--verify reads the files of earlier results: give --resume, too")
     if out is None and not dry_run:
         raise UsageError("no results store is named: give -o OUT.zarr, or --dry-run")
+    part = None if shard is None else parse_shard(shard)
     if quicklook is None:
         quicklook = importlib.util.find_spec("matplotlib") is not None
 
-    from leafflow_ti.capture import open_capture
-
-    opened = open_capture(capture)
-    from leafflow_ti import api
-
-    if dry_run:
-        typer.echo(api.plan_run(opened, configuration).describe())
-        return
-    assert out is not None
+    if follow and (shard is not None or dask is not None or verify or dry_run):
+        raise UsageError("--follow works alone: leave out --shard, --dask, --verify and --dry-run")
+    if follow_timeout is not None and not follow:
+        raise UsageError("--follow-timeout is for captures that are followed: give --follow, too")
     show = None if quiet else ProgressLine()
     try:
-        summary = api.run(opened, out, configuration, resume=resume, overwrite=overwrite, progress=show)
-    except KeyboardInterrupt:
-        typer.echo(f"interrupted: the same command with --resume goes on with {out}", err=True)
-        raise
+        if follow:
+            from leafflow_ti import arriving
+
+            assert out is not None, "no dry run"
+            summary = arriving.follow(
+                capture, out, configuration, resume=resume, overwrite=overwrite, timeout_s=follow_timeout,
+                outside=outside, progress=show, waiting=None if quiet else lambda text: write_line(f"waiting: {text}"),
+            )  # fmt: skip
+        else:
+            from leafflow_ti import api, runs
+            from leafflow_ti.capture import open_capture
+
+            opened = open_capture(capture, outside=outside)
+            if dry_run:
+                typer.echo(api.plan_run(opened, configuration).describe())
+                return
+            assert out is not None, "no dry run"
+            summary = runs.run(
+                opened, out, configuration, resume=resume, verify=verify, overwrite=overwrite, shard=part, dask=dask,
+                progress=show,
+            )  # fmt: skip
+    except KeyboardInterrupt as interrupt:
+        raise Interrupted.advised(interrupt, f"the same command with --resume goes on with {out}") from None
     finally:
         if show is not None:
             show.close()
-    pictures = write_pictures(out) if quicklook else None
+    # A shard that ends before the others has not all of the middle frame.
+    pictures = write_pictures(out) if quicklook and part is None else None
     if not quiet:
         typer.echo(format_summary(summary, pictures))
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """K and N of "K/N"; UsageError for anything else."""
+    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    if found is None:
+        raise UsageError(f"--shard {text}: must be K/N, for instance 3/16 for the third of sixteen parts")
+    return int(found[1]), int(found[2])
 
 
 def quicklook_folder(out: Path) -> Path:

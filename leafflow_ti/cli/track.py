@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from leafflow_ti.cli.log import with_log_file
 from leafflow_ti.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ def _option(name: str, metavar: str, help: str) -> Any:
     return typer.Option(f"--{name}", metavar=metavar, help=help, show_default=False)
 
 
+@with_log_file
 def track(
     result: Annotated[Path, typer.Argument(metavar="OUT.zarr", help="Results of 'leafflow-ti run'.")],
     out: Annotated[

@@ -11,7 +11,8 @@ import numpy as np
 from leafflow_ti.errors import MissingExtra
 from leafflow_ti.exporters.selection import Selection
 from leafflow_ti.field import empty_map, map_attributes
-from leafflow_ti.results import COORDINATES, TIME
+from leafflow_ti.results import TIME
+from leafflow_ti.store_arrays import COORDINATES
 
 _COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 

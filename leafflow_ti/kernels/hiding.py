@@ -2,7 +2,7 @@
 
 import functools
 
-from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.engine import Kernel, ti
 from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
 
@@ -36,7 +36,7 @@ def hiding_kernel(spec: KernelSpec):
                         for i in range(ti.max(col - 1, 0), ti.min(col + 2, cols)):
                             hidden[(image * rows + j) * cols + i] = 1
 
-    @ti.kernel
+    @Kernel
     def hiding(
         n_images: ti.i32,
         n_tasks: ti.i32,

@@ -15,7 +15,7 @@ neighbouring columns.
 import functools
 from enum import IntEnum, auto
 
-from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.engine import Kernel, ti
 from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
 BLOCK = 4
@@ -192,7 +192,7 @@ def arrange_kernel(spec: KernelSpec):
     """
     lanes = spec.lanes
 
-    @ti.kernel
+    @Kernel
     def arrange(
         n_images: ti.i32,
         rows: ti.i32,

@@ -5,7 +5,7 @@ Neighbouring threads are neighbouring columns.
 
 import functools
 
-from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.engine import Kernel, ti
 from leafflow_ti.kernels.moments import POWERS, formulas
 from leafflow_ti.kernels.spec import KernelSpec
 
@@ -15,7 +15,7 @@ def linear_kernel(spec: KernelSpec):
     """One linear pass over whole planes, ``dst[to + o plane + row pitch + x]``; for GPUs."""
     linear, _, _ = formulas(spec)
 
-    @ti.kernel
+    @Kernel
     def linear_planes(
         n_planes: ti.i32,
         begin: ti.i32,  # first output in the tables
@@ -57,7 +57,7 @@ def products_kernel(spec: KernelSpec):
     """Groups of products over whole planes; for GPUs."""
     _, products, _ = formulas(spec)
 
-    @ti.kernel
+    @Kernel
     def multiply_planes(
         n_groups: ti.i32,
         begin: ti.i32,
@@ -89,7 +89,7 @@ def window_kernel(spec: KernelSpec):
     """Windows along rows or columns of whole planes, ``dst[o, row, pitch]``; for GPUs."""
     _, _, window = formulas(spec)
 
-    @ti.kernel
+    @Kernel
     def window_planes(
         n_planes: ti.i32,
         rows: ti.i32,

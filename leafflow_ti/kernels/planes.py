@@ -6,7 +6,7 @@ shifts and weights make up which output is data (tables of terms), not code.
 
 import functools
 
-from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.engine import Kernel, ti
 from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
 
@@ -46,7 +46,7 @@ def filter_planes_kernel(spec: KernelSpec, col_step: int):
         for i in range(lanes):
             dst[at + i] = total[i]
 
-    @ti.kernel
+    @Kernel
     def filter_planes(
         n_planes: ti.i32,
         rows: ti.i32,
@@ -77,7 +77,7 @@ def filter_planes_kernel(spec: KernelSpec, col_step: int):
 def copy_kernel(spec: KernelSpec):
     """``dst[to + i] = src[i]``: a host block into its place on a GPU."""
 
-    @ti.kernel
+    @Kernel
     def copy(
         n: ti.i32,
         to: ti.i32,

@@ -126,7 +126,7 @@ def refine_kernel(spec: KernelSpec, taps: int, stage: Stage | None = None):
             elif ti.static(stage == Stage.SOLVE):
                 solver.solve(slot, size, value, P, p)
 
-    @lane_kernel(lanes, long=True)
+    @lane_kernel(lanes, long=True, numbers=True)
     def refine(
         first: ti.i32,
         n_pixels: ti.i32,

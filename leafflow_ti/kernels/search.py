@@ -11,7 +11,7 @@ of penalties ``p1`` between neighbouring labels and ``p2`` between any others; l
 
 import functools
 
-from leafflow_ti.kernels.engine import ti
+from leafflow_ti.kernels.engine import Kernel, ti
 from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
 
 NEAR = 9
@@ -173,7 +173,7 @@ def costs_kernel(spec: KernelSpec):
     costs, _, _ = _formulas(spec)
     real = spec.real
 
-    @ti.kernel
+    @Kernel
     def arm_costs(
         rows: ti.i32,
         cols: ti.i32,
@@ -216,7 +216,7 @@ def paths_kernel(spec: KernelSpec):
     _, path, _ = _formulas(spec)
     real = spec.real
 
-    @ti.kernel
+    @Kernel
     def add_paths(
         n_lines: ti.i32,
         rows: ti.i32,
@@ -262,7 +262,7 @@ def winners_kernel(spec: KernelSpec):
     _, _, winner = _formulas(spec)
     real = spec.real
 
-    @ti.kernel
+    @Kernel
     def choose(
         rows: ti.i32,
         cols: ti.i32,

@@ -11,7 +11,7 @@ import numpy as np
 from reference import chain
 
 from leafflow_ti.models import ColumnSet
-from leafflow_ti.sampling import Sampling, column_noise
+from leafflow_ti.sampling import Sampling
 
 Array = np.ndarray
 
@@ -36,7 +36,7 @@ class Cells:
         mass = partial(cell_sums, [np.ones((1, *vectors[0].shape[1:]))], sampling=sampling, exact=exact)
         return cls(
             cell_sums(vectors, seen, sampling, exact), mass(seen=seen)[:, 0, 0], C / mass(seen=whole), columns,
-            column_noise(sampling, columns), distances(sampling, exact),
+            chain.column_noise(sampling, columns), distances(sampling, exact),
         )  # fmt: skip
 
     @classmethod

@@ -4,15 +4,18 @@ the kernels.
 Only the tables (columns, filters, noise factors) come from the library.
 """
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
 from scipy.ndimage import correlate1d, minimum_filter
 
+from leafflow_ti import sampling as tables
 from leafflow_ti.models import AXES, ColumnSet
-from leafflow_ti.sampling import Sampling, column_noise, cross_noise, noise_ratio, pixel_factor
+from leafflow_ti.sampling import Sampling, cross_noise, noise_ratio, pixel_factor
 
+column_noise = functools.cache(tables.column_noise)
 ARRAY_AXIS = {"t": 0, "sy": 1, "sx": 2, "y": 3, "x": 4}
 
 

@@ -1,5 +1,7 @@
 """Rows of the motion fit at one pixel: what the flow's parameters say of N, Ω, A and ε, and the row of range flow."""
 
+import functools
+
 import numpy as np
 
 
@@ -62,12 +64,7 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved=None, c
 
     def projected(k, o):
         # Along s nothing is bent: what is seen there is the derivative of the flow alone.
-        found = np.zeros(10)
-        for column, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
-            share = curved["1xy".index(o), column] * (0.5 if i == j else 1.0)
-            if share:
-                found += share * second_derivative(x0, y0, f, (Z0, ZX, ZY), k, i, j)
-        return found
+        return (curved["1xy".index(o)] * (0.5, 1.0, 0.5)) @ second_derivatives(x0, y0, f, (Z0, ZX, ZY))[k]
 
     def measured(k, o):
         if o == "sx":
@@ -79,26 +76,31 @@ def motion_rows(x0, y0, f, geometry, offsets, q, shift, baseline, curved=None, c
     return np.array([measured(k, o) for k in (0, 1) for o in offsets])
 
 
-def second_derivative(x0, y0, f, plane, k, i, j):
-    """Coefficients [10] of (N, Ω, A, ε) of ∂²u_k/∂x_i∂x_j on the plane (Z0, ZX, ZY) at (x0, y0), by exact differences.
+@functools.cache  # the rows that one pixel needs ask for the same ones again and again
+def second_derivatives(x0, y0, f, plane):
+    """Coefficients [2, 3, 10] of (N, Ω, A, ε) of ∂²/∂x², ∂²/∂x∂y, ∂²/∂y² of the flow u, v on the plane (Z0, ZX, ZY) at
+    (x0, y0), by exact differences.
 
     The flow of a rigidly moving plane is quadratic in x and y, so second differences of any width are exact.
     """
     Z0, ZX, ZY = plane
     X0 = Z0 * np.array([x0 / f, y0 / f, 1.0])
+    h = 0.05 * f
 
-    def flow(d):
-        """Of each component of the motion alone."""
-        ray = np.array([(x0 + d[0]) / f, (y0 + d[1]) / f, 1.0])
+    def flow(i, j):
+        """Of each component of the motion alone [2, 10], i and j steps h away along x and y."""
+        ray = np.array([(x0 + i * h) / f, (y0 + j * h) / f, 1.0])
         X = (Z0 - ZX * X0[0] - ZY * X0[1]) / (1 - ZX * ray[0] - ZY * ray[1]) * ray
-        along = np.array([float(k == 0), float(k == 1), -ray[k]])
-        seen = np.zeros(10)
-        seen[:3], seen[3:6], seen[9] = along, cross(X - X0, along), along @ (X - X0)
+        seen = np.zeros((2, 10))
+        for k, along in enumerate(np.array([[1.0, 0.0, -ray[0]], [0.0, 1.0, -ray[1]]])):
+            seen[k, :3], seen[k, 3:6], seen[k, 9] = along, cross(X - X0, along), along @ (X - X0)
         return f * seen / X[2]
 
-    h = 0.05 * f
-    one, two = h * np.eye(2)[i], h * np.eye(2)[j]
-    return sum(s * t * flow(s * one + t * two) for s in (1, -1) for t in (1, -1)) / (4 * h**2)
+    at = {(i, j): flow(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    along_x = at[1, 0] - 2 * at[0, 0] + at[-1, 0]
+    along_y = at[0, 1] - 2 * at[0, 0] + at[0, -1]
+    mixed = (at[1, 1] - at[1, -1] - at[-1, 1] + at[-1, -1]) / 4
+    return np.stack([along_x, mixed, along_y], axis=1) / h**2
 
 
 def cross(u, v):
