@@ -60,13 +60,15 @@ def run(
     _check_shard(shard, overwrite)
     if shard and dask is not None:
         raise UsageError("--shard and --dask exclude each other: a cluster's workers share all units")
-    resume = resume or shard is not None
     with warnings_said() as said, contextlib.ExitStack() as inside:
         if not isinstance(capture, Capture):
             capture = open_capture(capture)
         for doubt in capture_doubts(capture):
             warn(doubt)
-        config, found, changed = config or RunConfig(), resume and out.exists(), False
+        config = config or RunConfig()
+        if shard and not out.exists():
+            _make_shared(out, capture, config, shard)
+        found, changed = (resume or shard is not None) and out.exists(), False
         plan = make_plan(capture, with_bands_of(as_decided(config, out), out) if found else config)
         attrs = provenance(plan, capture)
         left = set(_part(plan, shard))
@@ -84,7 +86,7 @@ def run(
         if not found or left:
             inside.enter_context(executor)
         if not found:
-            store = _made_store(out, plan, attrs, capture, overwrite, shard)
+            store = create_store(out, plan, attrs, capture, overwrite)
         inside.enter_context(as_shard(out, *shard) if shard else alone(out))
         if changed:
             store = take_new_input(store, plan, attrs)
@@ -112,16 +114,12 @@ def _check_shard(shard: Shard | None, overwrite: bool) -> None:
         raise UsageError("--shard and --overwrite exclude each other: remove the old results, or give another output")
 
 
-def _made_store(
-    out: Path, plan: Plan, attrs: dict[str, object], capture: Capture, overwrite: bool, shard: Shard | None
-) -> ResultStore:
-    """A new store, or the one that another shard has just made."""
-    try:
-        return create_store(out, plan, attrs, capture, overwrite)
-    except UsageError:
-        if shard is None:
-            raise
-        return open_store(out, plan, attrs, capture)[0]
+def _make_shared(out: Path, capture: Capture, config: RunConfig, shard: Shard) -> None:
+    """Make the store of all shards, unless another one has meanwhile: whoever has not made it plans as that one has."""
+    plan = make_plan(capture, config)
+    check_space(out, plan, len(_part(plan, shard)))
+    with contextlib.suppress(UsageError):
+        create_store(out, plan, provenance(plan, capture), capture, overwrite=False)
 
 
 def _part(plan: Plan, shard: Shard | None) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,12 @@ from small_plane import SCENE, capture_of, config, files_of, running_threads, wr
 import leafflow_ti as lf
 from leafflow_ti.capture import Capture
 from leafflow_ti.errors import InputError, PartlyDone, RunError
+from leafflow_ti.locks import FOLDER as LOCKS
+from leafflow_ti.plan import Plan, make_plan
 from leafflow_ti.progress import Progress, Timings
+from leafflow_ti.provenance import provenance
+from leafflow_ti.results import ResultStore
+from leafflow_ti.run_store import create_store
 
 
 @pytest.fixture(scope="module")
@@ -131,3 +137,22 @@ def test_what_differs_is_said_in_the_words_of_the_configuration(capture: Capture
     with pytest.raises(RunError) as said:
         lf.run(capture, tmp_path / "out.zarr", config(frames="5:6", window=11), resume=True)
     assert "another run: refine.window was 9, is 11; window.size was 9, is 11; use --overwrite" in str(said.value)
+
+
+def test_shard_on_another_machine_that_comes_second(
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both plan at once, with other limits of memory; who has not made the store takes the units of who has."""
+    mine, other, out = config(frames="4:6"), config(frames="4:6", tile=16), tmp_path / "out.zarr"
+    lf.run(capture, tmp_path / "whole.zarr", other)
+
+    def second(out: Path, plan: Plan, attrs: dict[str, object], *args: Any, **options: Any) -> ResultStore:
+        create_store(out, theirs := make_plan(capture, other), provenance(theirs, capture), *args, **options)
+        return create_store(out, plan, attrs, *args, **options)
+
+    monkeypatch.setattr("leafflow_ti.runs.create_store", second)
+    for number in (1, 2):
+        lf.run(capture, out, mine, shard=(number, 2))
+    for store in (out, tmp_path / "whole.zarr"):
+        shutil.rmtree(store / LOCKS)
+    assert files_of(out) == files_of(tmp_path / "whole.zarr")
