@@ -173,8 +173,8 @@ def lane_kernel(lanes, long=False, numbers=False):
 
     ``long``: without the engine's own search for what is computed twice and for what loops need not repeat. Its time
     grows with the square of the kernel's length, and the compiler behind it finds the same: measured on the refinement,
-    compiled in 7 s instead of 28, and as fast. ``numbers``: such a kernel's innermost loops are of plain numbers, which
-    the compiler makes vectors.
+    compiled in 7 s instead of 28, and as fast. ``numbers``: the innermost loops are of plain numbers, of which the
+    compiler makes vectors.
 
     What may not be written on vectors (the engine's own gaps): ``-v``, ``v -= w``, ``abs``, casts between precisions.
     Arrays of vectors must be aligned as ``runtime.Device.empty`` does.
@@ -184,7 +184,7 @@ def lane_kernel(lanes, long=False, numbers=False):
     settings = {"real_matrix_scalarize": False}
     if long:
         settings["advanced_optimization"] = False
-    if long and ENGINE == "taichi" and unrolls_too_much():
+    if ENGINE == "taichi" and unrolls_too_much():
         settings["front_end"] = functools.partial(loops_as_written, ENGINE, innermost=not numbers)
     return functools.partial(Kernel, **settings)
 
