@@ -30,7 +30,8 @@ def store(tmp_path: Path) -> ResultStore:
     missing = [{"unit": 3, "frame": 8, "rows": [12, 13], "reason": REASON, "attempts": 3}]
     store = ResultStore.create(
         tmp_path / "out.zarr", frames=[7, 8], y=[10, 11, 12, 13], x=[0, 1, 2], names=["depth"], chunk=(1, 2, 3),
-        attrs={"config": 'model = "depth"', "runs": runs, "missing": missing, "warnings": ["images are dark"]},
+        attrs={"config": 'model = "depth"', "runs": runs, "missing": missing, "warnings": ["images are dark"],
+               "input_files": "eNp9"},
     )  # fmt: skip
     for unit in range(3):
         first = unit % 2 * 2
@@ -54,7 +55,7 @@ def test_runs_and_missing_units_are_tables(store: ResultStore, capsys: pytest.Ca
     assert lines[at + 1].split() == ["unit", "frame", "rows", "attempts", "reason"]
     assert lines[at + 2] == f"  3     8      12 to 13  3         {REASON}"
     assert '  model = "depth"' in lines
-    assert not {"warnings", "missing", "measured_maps", "timings"} & set(lines)
+    assert not {"warnings", "missing", "measured_maps", "timings", "input_files", "  eNp9"} & set(lines)
 
 
 def test_json_has_all(store: ResultStore, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,8 @@ LISTED = 9
 """Most numbers of a list that are printed."""
 TABLED = ("timings", "runs", "missing", "warnings", "measured_maps")
 """Attributes that are shown as tables and sentences."""
+PACKED = ("input_files",)
+"""Attributes that only programs read: ``--json`` has them."""
 
 
 def store_facts(store: ResultStore) -> dict[str, Any]:
@@ -81,7 +83,7 @@ def store_lines(facts: dict[str, Any]) -> list[str]:
         )
         lines.append(f"{name:<22} {row['units']:<12} {numbers}")
     for key, value in attributes.items():
-        if key not in TABLED:
+        if key not in (*TABLED, *PACKED):
             lines += ["", key, *_indented(value)]
     return lines
 
