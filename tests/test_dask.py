@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import multiprocessing
@@ -187,6 +188,25 @@ def test_a_cluster_without_workers(folder: Path, tmp_path: Path, monkeypatch: py
         pytest.raises(RunError, match=r"the Dask cluster at tcp://.* had no worker for 0\.2 s: start some"),
     ):  # fmt: skip
         lf.run(folder, tmp_path / "out.zarr", config(), dask=empty.scheduler_address)
+
+
+@pytest.mark.parametrize("deaths", [2, 3])
+def test_local_workers_that_die_before_they_are_there(deaths: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual, starts = distributed.LocalCluster, []
+
+    def dying(**options: Any) -> Any:
+        starts.append(options)
+        if len(starts) <= deaths:
+            raise RuntimeError("Nanny failed to start.")  # as Dask says it
+        return usual(**options)
+
+    monkeypatch.setattr(distributed, "LocalCluster", dying)
+    with contextlib.ExitStack() as inside:
+        if deaths == 3:
+            inside.enter_context(pytest.raises(RunError, match=r"started 3 times, .* \(Nanny failed to start\): use"))
+        client = inside.enter_context(cluster_client.connected("local", config(workers=1).plan))
+        assert len(client.nthreads()) == 1
+    assert len(starts) == 3
 
 
 def test_what_workers_cannot_share(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from leafflow_ti.config_sections import PlanSection
 from leafflow_ti.errors import RunError, UsageError
+from leafflow_ti.events import event
+from leafflow_ti.executors.processes import STARTS
 from leafflow_ti.runtime import usable_threads
 
 if TYPE_CHECKING:
@@ -29,7 +31,7 @@ Made = TypeVar("Made")
 def connected(where: str | Client, plan: PlanSection) -> Iterator[Client]:
     """A client of the scheduler at an address, of a new cluster of ``plan.workers`` processes ("local"), or as given.
 
-    Raises UsageError for what is no address, RunError where nobody answers.
+    Raises UsageError for what is no address, RunError where nobody answers, or new processes die.
     """
     from distributed import Client
 
@@ -86,12 +88,24 @@ def _local_cluster(plan: PlanSection) -> Iterator[LocalCluster]:
     from distributed import LocalCluster
 
     def start() -> LocalCluster:
-        return LocalCluster(
-            n_workers=plan.workers, threads_per_worker=plan.threads_each(usable_threads()), memory_limit=None,
-            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"}, silence_logs=logging.CRITICAL,
-        )  # fmt: skip
+        for attempt in range(1, STARTS + 1):
+            try:
+                return LocalCluster(
+                    n_workers=plan.workers, threads_per_worker=plan.threads_each(usable_threads()), memory_limit=None,
+                    scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+                    silence_logs=logging.CRITICAL,
+                )  # fmt: skip
+            except RuntimeError as error:  # a process has died before it was there; those beside it are ended
+                failure = f"{error}".rstrip(".")
+                event(
+                    "worker_lost", f"the local Dask cluster has not started ({failure})", logging.ERROR, start=attempt
+                )
+        raise RunError(
+            f"the local Dask cluster was started {STARTS} times, and its workers died ({failure}): use fewer of them, "
+            "or --workers without --dask"
+        )
 
-    cluster = _uninterrupted(start, LocalCluster.close)
+    cluster = _uninterrupted(start, lambda cluster: cluster.close())
     try:
         yield cluster
     except BaseException:
