@@ -149,7 +149,8 @@ class _Following:
                 raise InputError(
                     f"{self.arrivals.path}: nothing has arrived for {self.timeout_s:g} s, and {n_frames} frames are "
                     f"needed, of which {len(self.arrivals.complete)} are complete: "
-                    f"{self.arrivals.lacking or 'no further one has begun'}"
+                    f"{self.arrivals.lacking or 'no further one has begun'}; add them or give a longer "
+                    "--follow-timeout, or run without --follow, which fits its windows in time to fewer frames"
                 )
             capture = self.arrivals.capture(n_frames)
             lasting = self._rehearsed(replace(capture, n_frames=MANY))
