@@ -139,7 +139,7 @@ def test_what_never_comes_is_named(taken: Path, growing_folder: Path, tmp_path: 
 
 
 def test_nothing_comes(growing_folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nothing has arrived for 0\.1 s, and 1 frames are needed.*: .*run without --follow"):
+    with pytest.raises(InputError, match=r"arrived for 0\.1 s, and 1 frames are needed.*run without --follow"):
         followed(growing_folder, tmp_path / "out.zarr")(timeout_s=0.1)
     assert not (tmp_path / "out.zarr").exists()
 
