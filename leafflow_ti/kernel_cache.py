@@ -22,9 +22,11 @@ from filelock import FileLock, Timeout
 
 from leafflow_ti.events import warn
 
-PATTERN = "*.tic"
-"""Files of the engine: one per kernel. What it knows of them is in ``INDEX``."""
 INDEX = "ticache.tcb"
+FILES = ("*.tic", INDEX, "kernel_compilation_manager/*.qdc", "kernel_compilation_manager/qdcache.qdb")
+"""Files of the engines, Taichi's and those of Quadrants: one per kernel, and one with what is known of them."""
+LOCKS = ("ticache.lock", "kernel_compilation_manager/qdcache.lock")
+"""What the engines lock their files by."""
 SUMS = "checksums.json"
 LOCK = "checksums.lock"
 STALE_LOCK_S = 60.0
@@ -55,10 +57,10 @@ def cache_folder() -> Path | None:
 def remove_stale_lock(folder: Path) -> None:
     """The engine locks its cache by a file for milliseconds; one that was killed then leaves it, and no process after
     it would use the cache again."""
-    lock = folder / "ticache.lock"
-    with contextlib.suppress(OSError):
-        if time.time() - lock.stat().st_mtime > STALE_LOCK_S:
-            lock.unlink()
+    for lock in (folder / name for name in LOCKS):
+        with contextlib.suppress(OSError):
+            if time.time() - lock.stat().st_mtime > STALE_LOCK_S:
+                lock.unlink()
 
 
 def remove_damaged(folder: Path) -> None:
@@ -93,14 +95,14 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted([*folder.glob(PATTERN), *folder.glob(INDEX)])
+    return sorted(file for pattern in FILES for file in folder.glob(pattern))
 
 
 def _sums(folder: Path) -> dict[str, int]:
     found = {}
     for file in _files(folder):
         with contextlib.suppress(OSError):  # the engine removes what was not used for long
-            found[file.name] = zlib.crc32(file.read_bytes())
+            found[file.relative_to(folder).as_posix()] = zlib.crc32(file.read_bytes())
     return found
 
 

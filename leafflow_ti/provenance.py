@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import tomllib
 from collections.abc import Collection
@@ -54,7 +55,8 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             return "absent"
 
-    return {"python": platform.python_version()} | {p: installed(p) for p in ("taichi", "numpy", "zarr")}
+    engine = os.environ.get("LEAFFLOW_TI_ENGINE", "taichi")
+    return {"python": platform.python_version()} | {p: installed(p) for p in (engine, "numpy", "zarr")}
 
 
 def differences(stored: dict[str, Any], now: dict[str, Any], spared: Collection[str] = ()) -> list[str]:

@@ -185,7 +185,8 @@ def _keep_kernels(cache: Path) -> None:
 @contextlib.contextmanager
 def _hidden(*settings: str) -> Iterator[None]:
     """Without the engine's own variables for these settings: TI_ARCH would overrule the device that is asked for."""
-    hidden = {name: os.environ.pop(name) for name in (f"TI_{s.upper()}" for s in settings) if name in os.environ}
+    names = [f"{prefix}_{setting.upper()}" for prefix in ("TI", "QD") for setting in settings]
+    hidden = {name: os.environ.pop(name) for name in names if name in os.environ}
     try:
         yield
     finally:

@@ -1,11 +1,14 @@
-"""``python tests/adopting_host.py CAPTURE``: a host that has initialised Taichi as it likes; the checksum of what its
-guest measures, and whether the host finds its settings again, as JSON."""
+"""``python tests/adopting_host.py CAPTURE``: a host that has initialised the engine as it likes; the checksum of what
+its guest measures, and whether the host finds its settings again, as JSON."""
 
+import importlib
 import json
+import os
 import sys
 
 import numpy as np
-import taichi as ti
+
+ti = importlib.import_module(os.environ.get("LEAFFLOW_TI_ENGINE", "taichi"))
 
 ti.init(
     arch=ti.cpu, debug=True, default_fp=ti.f64, default_ip=ti.i64, fast_math=False, cpu_max_num_threads=1,

@@ -21,6 +21,8 @@ from leafflow_ti.runtime import start
 HERE = Path(__file__).parent
 NEEDED = ("PATH", "SYSTEMROOT", "LD_LIBRARY_PATH")
 """Variables that a Python process cannot do without."""
+QUADRANTS = ("kernel_compilation_manager", "qdc", "qdcache.qdb")
+"""Where that engine keeps its kernels, how their names end, and what it knows of them."""
 
 
 def said(script: str, *arguments: str, python: tuple[str, ...] = (), **more: Any) -> dict[str, Any]:
@@ -76,7 +78,8 @@ def test_threads_loops_forks_and_a_poor_environment(capture: Path, cache: str, m
         os.umask(0o077)
 
     environment = {name: os.environ[name] for name in NEEDED if name in os.environ}
-    environment |= {"LC_ALL": "C", "TERM": "dumb", "NO_COLOR": "1", "TI_ARCH": "vulkan", "LEAFFLOW_TI_ARCH": "cpu",
+    environment |= {"LC_ALL": "C", "TERM": "dumb", "NO_COLOR": "1", "TI_ARCH": "vulkan", "QD_ARCH": "vulkan",
+                    "LEAFFLOW_TI_ARCH": "cpu", "LEAFFLOW_TI_ENGINE": os.environ.get("LEAFFLOW_TI_ENGINE", "taichi"),
                     "LEAFFLOW_TI_CACHE": cache, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}  # fmt: skip
     found = said("guest.py", str(capture), python=("-O", "-W", "error"), env=environment, preexec_fn=leave)
     fork = found.pop("fork")
@@ -85,8 +88,6 @@ def test_threads_loops_forks_and_a_poor_environment(capture: Path, cache: str, m
 
 
 def test_a_host_that_has_initialised_the_engine(capture: Path, cache: str, measured: str, tmp_path: Path) -> None:
-    if os.environ.get("LEAFFLOW_TI_ENGINE", "taichi") != "taichi":
-        pytest.skip("the host of this test uses Taichi")
     own = shutil.copytree(cache, tmp_path / "kernels")  # what a host keeps is not ours to check
     path = os.pathsep.join([str(HERE), *(p for p in sys.path if p)])
     found = said("adopting_host.py", str(capture), str(own), env={**os.environ, "PYTHONPATH": path})
@@ -122,26 +123,31 @@ def test_a_folder_that_cannot_be_used_is_said(
     assert "LEAFFLOW_TI_CACHE" in record.message
 
 
-def test_damaged_kernels_are_removed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(("below", "ending", "index"), [(".", "tic", kernel_cache.INDEX), QUADRANTS])
+def test_damaged_kernels_are_removed(
+    below: str, ending: str, index: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Bytes that change on a disk, which the engine would execute."""
-    kernels = [tmp_path / name for name in ("T1.tic", "T2.tic", kernel_cache.INDEX)]
+    kernels = [tmp_path / below / name for name in (f"T1.{ending}", f"T2.{ending}", index)]
     kernel_cache.remove_damaged(tmp_path)
 
     def flush() -> None:
+        (tmp_path / below).mkdir(exist_ok=True)
         for file in kernels:
             file.write_bytes(file.name.encode() * 1000)
 
     kernel_cache.write(tmp_path, flush)
     kernel_cache.remove_damaged(tmp_path)
-    (tmp_path / "T3.tic").write_bytes(b"of an earlier version, without a checksum")
+    earlier = tmp_path / below / f"T3.{ending}"
+    earlier.write_bytes(b"of an earlier version, without a checksum")
     kernel_cache.remove_damaged(tmp_path)
     assert all(file.exists() for file in kernels)
     assert caplog.records == []
     kernels[1].write_bytes(kernels[1].read_bytes()[:-1] + b"?")
     with caplog.at_level(logging.WARNING):
         kernel_cache.remove_damaged(tmp_path)
-    assert "T2.tic" in caplog.records[0].message
-    assert not any(file.exists() for file in [*kernels, tmp_path / "T3.tic"])
+    assert f"T2.{ending}" in caplog.records[0].message
+    assert not any(file.exists() for file in [*kernels, earlier])
     kernel_cache.write(tmp_path, flush)
     (tmp_path / kernel_cache.SUMS).write_text("[not JSON")
     kernel_cache.remove_damaged(tmp_path)
@@ -166,3 +172,24 @@ def test_streams_that_nobody_reads(case: str, capture: Path) -> None:
     line = STREAMS[case].format(program=f"'{sys.executable}' -m leafflow_ti.cli.main", capture=f"'{capture}'")
     done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize(("engine", "way_out"), [("tachi", "taichi and quadrants"), ("quadrants", "pip install")])
+def test_an_engine_that_is_not_there(engine: str, way_out: str, tmp_path: Path) -> None:
+    """Chosen by a name that no engine has, or not installed."""
+    code = """
+import sys
+sys.modules["quadrants"] = None
+from leafflow_ti.errors import DeviceError
+from leafflow_ti.runtime import start
+try:
+    start("cpu")
+except DeviceError as error:
+    print(error)
+"""
+    environment = {**os.environ, "LEAFFLOW_TI_ENGINE": engine, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
+    assert done.stderr == ""
+    (line,) = done.stdout.splitlines()
+    assert f"'{engine}'" in line
+    assert way_out in line

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from leafflow_ti.errors import RunError, UsageError
-from leafflow_ti.kernel_cache import remove_stale_lock
+from leafflow_ti.kernel_cache import LOCKS, remove_stale_lock
 from leafflow_ti.locks import FOLDER, abandoned, alone, as_shard
 from leafflow_ti.placing import put_in_place, remove_abandoned
 from leafflow_ti.results import ResultStore
@@ -122,8 +122,10 @@ def test_locks_are_out_of_the_way_of_readers(store: Path) -> None:
         assert ResultStore.open(store).done() == set()
 
 
-def test_the_engine_s_lock_that_a_killed_process_has_left(tmp_path: Path) -> None:
-    lock = tmp_path / "ticache.lock"
+@pytest.mark.parametrize("name", LOCKS)
+def test_the_engine_s_lock_that_a_killed_process_has_left(name: str, tmp_path: Path) -> None:
+    lock = tmp_path / name
+    lock.parent.mkdir(exist_ok=True)
     lock.touch()
     remove_stale_lock(tmp_path)
     assert lock.exists()  # somebody may hold it

@@ -204,11 +204,19 @@ def test_plan_counts_every_output_plane() -> None:
 def test_the_engine_is_left_as_it_was() -> None:
     from leafflow_ti.kernels.engine import ENGINE, lane_kernel, quick_front_end, ti
 
-    kernels = importlib.import_module(f"{ENGINE}.lang.kernel_impl")
     contexts = importlib.import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
+    if ENGINE == "taichi":
+        kernels = importlib.import_module("taichi.lang.kernel_impl")
+        places = ((kernels, "getsourcelines"), (kernels, "textwrap"), (contexts.ASTTransformerContext, "get_pos_info"))
+    else:
+        kernels = importlib.import_module("quadrants.lang._func_base")
+        places = (
+            (kernels, "get_source_info_and_src"), (kernels, "textwrap"),
+            (contexts.ASTTransformerFuncContext, "_build_pos_info"),
+        )  # fmt: skip
 
     def settings() -> tuple[object, ...]:
-        return kernels.getsourcelines, kernels.textwrap, contexts.ASTTransformerContext.get_pos_info
+        return tuple(getattr(*place) for place in places)
 
     usual = settings()
     with quick_front_end():

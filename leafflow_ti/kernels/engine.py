@@ -17,6 +17,7 @@ from leafflow_ti.stopping import ended_at_once
 # Without these the engine prints a banner to stdout and asks a server for newer versions.
 os.environ["TI_SKIP_VERSION_CHECK"] = "ON"
 os.environ["ENABLE_TAICHI_HEADER_PRINT"] = "False"
+os.environ["ENABLE_QUADRANTS_HEADER_PRINT"] = "False"
 if os.name == "posix" and "HOME" not in os.environ:  # services have none, and without it the engine ends the process
     try:
         os.environ["HOME"] = str(Path.home())
@@ -25,10 +26,36 @@ if os.name == "posix" and "HOME" not in os.environ:  # services have none, and w
 
 ENGINE = os.environ.get("LEAFFLOW_TI_ENGINE", "taichi")
 if ENGINE not in ("taichi", "quadrants"):
-    raise ImportError(f"LEAFFLOW_TI_ENGINE is '{ENGINE}': allowed are taichi and quadrants")
-with warnings.catch_warnings():  # what it does is not to be mended here, where hosts make errors of warnings
-    warnings.simplefilter("ignore", DeprecationWarning)
-    ti = importlib.import_module(ENGINE)
+    raise DeviceError(f"LEAFFLOW_TI_ENGINE is '{ENGINE}': allowed are taichi and quadrants")
+
+
+@contextlib.contextmanager
+def _quiet_import():
+    """Quadrants tells on standard error that standard output is a notebook's, or a test's; a level that was chosen
+    stays."""
+    chosen = "QD_LOG_LEVEL" in os.environ
+    if not chosen:
+        os.environ["QD_LOG_LEVEL"] = "error"
+    try:
+        with warnings.catch_warnings():  # what it does is not to be mended here, where hosts make errors of warnings
+            warnings.simplefilter("ignore", DeprecationWarning)
+            yield
+    finally:
+        if not chosen:
+            del os.environ["QD_LOG_LEVEL"]
+
+
+try:
+    with _quiet_import():
+        ti = importlib.import_module(ENGINE)
+except ModuleNotFoundError as error:
+    if error.name != ENGINE:
+        raise
+    raise DeviceError(
+        f"LEAFFLOW_TI_ENGINE is '{ENGINE}', which is not installed: pip install {ENGINE}, or unset it for taichi"
+        if ENGINE != "taichi"
+        else "Taichi is not installed: pip install taichi, or set LEAFFLOW_TI_ENGINE=quadrants and install that"
+    ) from None
 
 _launching = threading.RLock()
 """The engine compiles and launches for one thread at a time; a launch holds the interpreter anyway."""
@@ -37,7 +64,8 @@ _forked = False
 
 def running() -> bool:
     """Whether the engine is initialised in this process, by us or by a host."""
-    return ti.lang.impl.get_runtime().prog is not None
+    runtime = ti.lang.impl.get_runtime()
+    return (runtime.prog if ENGINE == "taichi" else runtime._prog) is not None
 
 
 def forked() -> bool:
@@ -94,14 +122,24 @@ def quick_front_end():
 
 
 def _make_quick(undo):
-    kernels = importlib.import_module(f"{ENGINE}.lang.kernel_impl")
-    contexts = importlib.import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
-    quick = [
-        (kernels, "getsourcelines", lambda usual: functools.cache(usual)),
-        (kernels, "textwrap", lambda usual: SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=usual.dedent)),
-        (contexts.ASTTransformerContext, "get_pos_info", lambda usual: _position),
-    ]
-    for owner, name, make in quick:
+    def plain(usual):
+        return SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=usual.dedent)
+
+    quick = {
+        "taichi": [
+            ("lang.kernel_impl", "getsourcelines", functools.cache),
+            ("lang.kernel_impl", "textwrap", plain),
+            ("lang.ast.ast_transformer_utils", "ASTTransformerContext.get_pos_info", lambda usual: _position),
+        ],
+        "quadrants": [
+            ("lang._func_base", "get_source_info_and_src", functools.cache),
+            ("lang._func_base", "textwrap", plain),
+            ("lang.ast.ast_transformer_utils", "ASTTransformerFuncContext._build_pos_info", lambda usual: _position),
+        ],
+    }
+    for module, path, make in quick[ENGINE]:
+        *classes, name = path.split(".")
+        owner = functools.reduce(getattr, classes, importlib.import_module(f"{ENGINE}.{module}"))
         usual = getattr(owner, name, None)
         if usual is not None:
             setattr(owner, name, make(usual))
