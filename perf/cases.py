@@ -80,6 +80,8 @@ CASES = (
     Case(
         "compare", "compare:run", "beside NumPy/SciPy, numba, PyTorch, structure-tensor, scikit-image: times, agreement"
     ),
+    Case("backend-epi", "backend_epi:run", "disparity of nine noisy views beside the structure-tensor package"),
+    Case("backend-flow", "backend_flow:run", "flow by noise beside OpenCV and scikit-image: errors and times"),
     Case(
         "tracking", "tracking:run", "material followed over 60 frames: drift and cumulative growth, exact and measured"
     ),

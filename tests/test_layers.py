@@ -71,6 +71,7 @@ LAYERS: dict[str, int] = {
     **dict.fromkeys(("napari_reader",), 7),
     **dict.fromkeys(("rig", "rig_choices", "inspection", "inspection_advice", "inspection_report"), 7),
     **dict.fromkeys(("drift", "interpolation", "neighbourhood"), 3),
+    **dict.fromkeys(("backend",), 7),
     **dict.fromkeys(("point_maps", "tracks", "tracking", "cumulative", "leaf_axes"), 7),
     **dict.fromkeys(("cli",), 8),
 }

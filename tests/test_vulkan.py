@@ -23,6 +23,7 @@ import test_range_flow
 import test_refine
 from reference import chain, patch
 from refine_bench import SCENE, Case, covariance, estimated
+from test_backend_flow import assert_follow_equals_twin
 from test_kernels_estimate import assert_maps_equal
 from test_prefilter import assert_equals_twin
 from test_search import assert_search_equals_twin
@@ -65,7 +66,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 11} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 12} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -185,3 +186,7 @@ def on_vulkan_a_flat_patch_equals_the_twin(device: Callable) -> None:
     errors = np.sqrt(np.diag(wanted.covariance))
     assert np.abs(estimated(found.parameters[0] - wanted.state, case) / errors).max() < 0.05
     np.testing.assert_allclose(np.sqrt(np.diag(covariance(found, case))) / errors, 0.997, atol=0.015)
+
+
+def on_vulkan_following_equals_naive_loops(device: Callable) -> None:
+    assert_follow_equals_twin(device("f32"), 2, True, 1e-3)

@@ -14,11 +14,7 @@ import functools
 from leafflow_ti.kernels.dense import dense, tri
 from leafflow_ti.kernels.engine import Kernel, lane_kernel, ti
 from leafflow_ti.kernels.spec import TASK_GRAIN, KernelSpec
-
-MARGIN = 2
-"""Coefficients beside an image that its border pixels need."""
-TEXTURE, SLOPE, LEVER, SQUARES, COUNT = range(5)
-"""Planes of ``follow_kernel``: T, p, S, sum of the squared residuals of a constant, number of images less one."""
+from leafflow_ti.kernels.warp_planes import COUNT, LEVER, MARGIN, SLOPE, SQUARES, TEXTURE
 
 
 @functools.cache

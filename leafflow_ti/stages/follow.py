@@ -8,7 +8,7 @@ to be explained.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leafflow_ti.filters import gaussian_weights
-from leafflow_ti.kernels.warp import LEVER, MARGIN, TEXTURE
+from leafflow_ti.kernels.warp_planes import LEVER, MARGIN, TEXTURE
 from leafflow_ti.runtime import Device
 from leafflow_ti.splines import filter_taps
 from leafflow_ti.stages.planes import Filtering, round_up
@@ -36,8 +36,11 @@ thousandth of the usual texture is left, and taken from coarser images where the
 @dataclass(frozen=True)
 class Following:
     """How flow is fitted. ``components``: 2, or 1 for motion along x alone; ``affine``: in a window, else constant;
-    ``weights``: of the window along each axis, symmetric, sum 1; ``steps`` at full resolution; ``coarse_steps`` and
-    the Gaussian ``coarse_sigma`` [px] of the coarser ones; ``levels`` of these, None: as many as the image allows."""
+    ``weights``: of the window along each axis, symmetric, sum 1; ``steps`` at full resolution.
+
+    Of coarser images, ``levels`` (None: as many as the image allows), each with ``coarse_steps`` and constant flow in a
+    Gaussian of ``coarse_sigma`` px, or with the ``same_window``. ``median``: of 3 x 3 pixels before each step, against
+    outliers."""
 
     components: int
     affine: bool
@@ -46,7 +49,8 @@ class Following:
     coarse_steps: int = 3
     coarse_sigma: float = 4.0
     levels: int | None = None
-    smoothing: float = 0.0
+    median: bool = False
+    same_window: bool = False
 
     @property
     def scale(self) -> float:
@@ -60,26 +64,37 @@ def gaussian_window(sigma: float, cut: float = CUT) -> tuple[float, ...]:
     return tuple(gaussian_weights(2 * max(1, round(cut * sigma)) + 1, sigma).tolist())
 
 
-def follow(device: Device, images: Array, levers: Array, how: Following, errors: bool) -> tuple[Array, Array | None]:
-    """Flow [components, y, x] in px per lever of ``images`` [k, y, x] with ``levers`` [k], and its standard error."""
+def follow(
+    device: Device, images: Array, levers: Array, how: Following, errors: bool = False, initial: Array | None = None
+) -> tuple[Array, Array | None]:
+    """Flow [components, y, x] in px per lever of ``images`` [k, y, x] with ``levers`` [k], and its standard error.
+
+    ``initial``: flow [components, y, x] to begin with; 0 without.
+    """
     pyramid = [np.asarray(images, device.real("storage"))]
     for _ in range(_levels(how, *images.shape[1:])):
         pyramid.append(halved(pyramid[-1]))
     flow = np.zeros((how.components, *pyramid[-1].shape[1:]), pyramid[0].dtype)
-    coarse = Following(how.components, False, gaussian_window(how.coarse_sigma))
+    if initial is not None:
+        apart = 2 ** (len(pyramid) - 1)
+        flow = np.asarray(initial[:, ::apart, ::apart] / apart, pyramid[0].dtype)
+    coarse = replace(how, steps=how.coarse_steps, median=how.median)
+    if not how.same_window:
+        coarse = replace(coarse, affine=False, weights=gaussian_window(how.coarse_sigma))
     std: Array | None = None
     while pyramid:
         last = len(pyramid) == 1
         level = Level(device, pyramid.pop(), levers, how if last else coarse)
         flow = resized(flow, level.shape) if flow.shape[1:] != level.shape else flow
-        flow, std = level.solve(flow, how.steps if last else how.coarse_steps, errors and last)
+        flow, std = level.solve(flow, errors and last)
     return flow, std
 
 
 def _levels(how: Following, rows: int, cols: int) -> int:
+    """Of the coarser images, 4 pixels across at least."""
     if how.levels is not None:
-        return how.levels
-    return max(0, int(np.log2(max(1, min(rows, cols)) / SMALLEST)))
+        return min(how.levels, max(0, int(np.log2(min(rows, cols) / 4))))
+    return max(0, int(np.log2(min(rows, cols) / SMALLEST)))
 
 
 def halved(images: Array) -> Array:
@@ -124,7 +139,7 @@ class Level:
 
     def _coefficients(self, images: Array) -> None:
         """Cubic spline coefficients with a margin, continued by reflection."""
-        taps = filter_taps(3, self.how.smoothing)
+        taps = filter_taps(3, 0.0)
         radius = len(taps) // 2
         rows, cols = self.rows + 2 * MARGIN, self.cols + 2 * MARGIN
         self._image_wide = round_up(cols, LANES)
@@ -189,8 +204,8 @@ class Level:
             self.rows, self.pitch, self._wide,
         )  # fmt: skip
 
-    def solve(self, flow: Array, steps: int, errors: bool) -> tuple[Array, Array | None]:
-        """The flow [c, y, x] after so many steps, and with ``errors`` its standard error."""
+    def solve(self, flow: Array, errors: bool) -> tuple[Array, Array | None]:
+        """The flow [c, y, x] after all steps, and with ``errors`` its standard error."""
         from leafflow_ti.kernels.spec import KernelSpec
         from leafflow_ti.kernels.warp import flow_products_kernel, flow_solve_kernel, follow_kernel
 
@@ -214,8 +229,11 @@ class Level:
             return device.vectors(array, spec.lanes)
 
         damping = None
-        for step in range(steps):
-            last = errors and step == steps - 1
+        for step in range(self.how.steps):
+            last = errors and step == self.how.steps - 1
+            if self.how.median:
+                start[:, :, : self.cols] = median_of_nine(self._maps(moving))
+                device.write(moving, 0, start)
             follow_kernel(device.planes, c)(
                 self.n_images, self.rows, self.cols, self.pitch, self._image_wide, tasks, self.levers, self.image,
                 moving, planes,
@@ -250,6 +268,14 @@ class Level:
         mean = max(mean, 1e-20)
         hold = [HOLD_FLOW, *[HOLD_SLOPES] * (self.n_terms - 1)] * self.how.components
         return self.device.array(np.array(hold) * mean)
+
+
+def median_of_nine(maps: Array) -> Array:
+    """Median over 3 x 3 pixels of maps [n, y, x], reflected at the border."""
+    rows, cols = maps.shape[1:]
+    padded = maps[:, reflected(rows, 1)[:, None], reflected(cols, 1)]
+    shifted = [padded[:, dy : dy + rows, dx : dx + cols] for dy in range(3) for dx in range(3)]
+    return np.asarray(np.median(shifted, axis=0), maps.dtype)
 
 
 def reflected(n: int, margin: int) -> NDArray[np.int64]:
