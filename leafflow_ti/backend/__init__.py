@@ -1,0 +1,30 @@
+"""The kernels as plain functions on arrays, for other programs: NumPy in, NumPy out; torch tensors in, tensors out.
+
+    from leafflow_ti import backend
+    flow = backend.optical_flow(frames)
+
+Importing it starts no compute engine and loads no heavy module; the names below load theirs when first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from leafflow_ti.backend.boundary import ArrayError, ArrayTypeError
+    from leafflow_ti.backend.flow import epi_disparity, optical_flow
+
+_HOME = {
+    "ArrayError": "boundary", "ArrayTypeError": "boundary",
+    "optical_flow": "flow", "epi_disparity": "flow",
+}  # fmt: skip
+__all__ = ["ArrayError", "ArrayTypeError", "epi_disparity", "optical_flow"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'leafflow_ti.backend' has no attribute '{name}'")
+    return getattr(import_module(f"leafflow_ti.backend.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])
