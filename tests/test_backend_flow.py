@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from reference.follow import step
 
+from leafflow_ti.backend import epi_disparity, optical_flow
 from leafflow_ti.backend.compat import cv2
 from leafflow_ti.backend.compat.skimage.registration import optical_flow_ilk
-from leafflow_ti.backend import epi_disparity, optical_flow
 from leafflow_ti.errors import ConfigError, InputError
 from leafflow_ti.filters import gaussian_weights
 from leafflow_ti.stages.follow import HOLD_FLOW, HOLD_SLOPES, Following, Level, halved, median_of_nine, resized
