@@ -20,7 +20,7 @@ test: $(BIN)/.installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-quadrants: $(BIN)/.installed
-	LEAFFLOW_TI_ENGINE=quadrants $(BIN)/python -m pytest -n 2 --dist loadfile
+	LEAFFLOW_TI_ENGINE=quadrants $(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
 
 lint: $(BIN)/.installed
 	$(BIN)/ruff check .

@@ -55,6 +55,14 @@ def test_loops_run_to_their_end(device: Callable[[str], Device], wrong: bool, mo
     assert transformer.build_range_for is usual
 
 
+def test_numbers_of_numpy_are_numbers(device: Callable[[str], Device]) -> None:
+    """Without a warning, which is an error here: Quadrants makes one of ``numpy.int64``."""
+    device("f64")
+    out = np.zeros(3, np.int32)
+    _kernel()(np.int64(3), np.int64(5), out)
+    assert out.tolist() == [0, 0, 10 + 1000]
+
+
 @pytest.mark.parametrize(
     ("text", "wrong"),
     [

@@ -10,6 +10,8 @@ import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
+
 from leafflow_ti.errors import DeviceError
 from leafflow_ti.kernels.unrolling import loops_as_written, unrolls_too_much
 from leafflow_ti.stopping import ended_at_once
@@ -176,9 +178,14 @@ class Kernel:
             if not self._compiled:
                 undo.enter_context(ended_at_once())
             undo.enter_context(self._front_end())
-            result = self._kernel(*arguments)
+            result = self._kernel(*map(_plain, arguments))
             self._compiled = True
             return result
+
+
+def _plain(argument):
+    """NumPy's numbers as Python's: Quadrants warns of others, and looks such launches up anew each time."""
+    return argument.item() if isinstance(argument, np.generic) else argument
 
 
 SETTINGS = {
