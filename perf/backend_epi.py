@@ -78,13 +78,13 @@ def of_stack(views: Array, sigma: float, rho: float) -> Array:
 
 
 def of_slices(views: Array, sigma: float, rho: float) -> Array:
-    """By the 2D tensor of every epipolar plane image; its eigenvectors are (x, s)."""
+    """By the 2D tensor of every epipolar plane image; its eigenvectors are (s, x)."""
     package: Any = importlib.import_module("structure_tensor")
     rows = []
     for y in range(views.shape[1]):
         _, vector = package.eig_special_2d(package.structure_tensor_2d(views[:, y], sigma, rho))
         with np.errstate(divide="ignore", invalid="ignore"):
-            rows.append((vector[0] / vector[1])[VIEWS // 2])
+            rows.append((vector[1] / vector[0])[VIEWS // 2])
     return np.stack(rows)
 
 
