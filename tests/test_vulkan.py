@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import test_backend_eigen
 import test_cut_windows
 import test_estimators
 import test_kernels_tensor
@@ -75,6 +76,12 @@ def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
     assert device("f32").arch == "vulkan"
     assert device("f32").gpu
     assert ti.lang.impl.current_cfg().arch == ti.vulkan
+
+
+def on_vulkan_eigenproblems_are_solved(device: Callable) -> None:
+    some = test_backend_eigen.matrices(6).astype(np.float32)
+    values, vectors = test_backend_eigen.solved(device("f32"), some, 6)
+    test_backend_eigen.assert_solved(some, values, vectors, test_backend_eigen.BOUND[np.float32])
 
 
 def on_vulkan_filtering_is_correlation(device: Callable) -> None:
