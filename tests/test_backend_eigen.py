@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from reference.eigen_cases import assert_solved, matrices
 
+from leafflow_ti import backend
+from leafflow_ti.backend.compat.skimage import feature
+from leafflow_ti.errors import ConfigError
 from leafflow_ti.runtime import Device, start
 from leafflow_ti.stages import eigen
 from leafflow_ti.stages.eigen import eigenproblems
@@ -37,7 +41,7 @@ def cpu() -> Device:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 9, 17, 32])
 def test_whole_decompositions(cpu: Device, n: int, dtype: type) -> None:
-    some = matrices(n)[:, :, :].astype(dtype) if n > 1 else np.array([[[2.0]], [[0.0]], [[-3.0]]], dtype)
+    some = matrices(n).astype(dtype) if n > 1 else np.array([[[2.0]], [[0.0]], [[-3.0]]], dtype)
     values, vectors = solved(cpu, some, n)
     assert_solved(some, values, vectors, BOUND[dtype])
 
@@ -89,3 +93,85 @@ def test_no_matrices_have_no_results(cpu: Device) -> None:
     values, vectors = solved(cpu, np.zeros((0, 3, 3)), 2)
     assert values.shape == (0, 2)
     assert vectors.shape == (0, 3, 2)
+
+
+def test_eigh_reads_the_lower_triangle() -> None:
+    some = matrices(5).reshape(37, 1, 5, 5)
+    values, vectors = backend.eigh(np.tril(some) + np.triu(np.full((5, 5), 7.0), 1))
+    assert_solved(some, values, vectors, BOUND[np.float64])
+    np.testing.assert_array_equal(backend.eigh(some, k=2, eigenvectors=False), values[..., :2])
+
+
+def test_null_space_of_what_has_one() -> None:
+    columns = np.random.default_rng(3).normal(size=(6, 20, 9))
+    columns[:, :, 7:] = columns[:, :, :2] - columns[:, :, 2:4]
+    found = backend.null_space(np.swapaxes(columns, 1, 2) @ columns, 2)
+    assert np.abs(columns @ found.vectors).max() < 1e-12
+    assert np.abs(found.values).max() < 1e-12
+    assert (found.gap > 0.1).all()
+    assert np.isinf(backend.null_space(np.eye(2), 2).gap)
+
+
+def fields(size: int) -> NDArray[Any]:
+    """Tensors of random columns [size, 7, 5], positive definite, packed as the package structure-tensor has them."""
+    n = {3: 2, 6: 3}[size]
+    columns = np.random.default_rng(n).normal(size=(n, 4, 7, 5))
+    pairs = [(r, r) for r in range(n)] + list(itertools.combinations(range(n), 2))
+    return np.array([(columns[r] * columns[c]).sum(axis=0) for r, c in pairs])
+
+
+def test_eig_special_2d_is_the_package_s() -> None:
+    peer = pytest.importorskip("structure_tensor")
+    S = fields(3)
+    S[2, 0], S[0, 0, 0] = 0, 9  # diagonal ones
+    values, vectors = peer.eig_special_2d(S)
+    found = backend.eig_special_2d(S)
+    np.testing.assert_allclose(found[0], values, atol=1e-12)
+    np.testing.assert_allclose(found[1], vectors, atol=1e-10)
+    both = backend.eig_special_2d(S, full=True)[1]
+    np.testing.assert_array_equal(both[0], found[1])
+    np.testing.assert_allclose((both[0] * both[1]).sum(axis=0), 0, atol=1e-12)
+    np.testing.assert_array_equal(backend.eigenvalues_2d(S), found[0])
+
+
+@pytest.mark.parametrize("order", ["desc", "asc"])
+@pytest.mark.parametrize("full", [False, True])
+def test_eig_special_3d_is_the_package_s(full: bool, order: Any) -> None:
+    peer = pytest.importorskip("structure_tensor")
+    S = fields(6)
+    found = backend.eig_special_3d(S, full, order)
+    for one, other in zip(found, peer.eig_special_3d(S, full, order), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+    np.testing.assert_array_equal(backend.eigenvalues_3d(S, order), found[0])
+
+
+def test_eigenvalues_as_scikit_image_has_them() -> None:
+    theirs = pytest.importorskip("skimage.feature")
+    elements = list(np.random.default_rng(4).normal(size=(6, 4, 5, 3)))
+    wanted = theirs.hessian_matrix_eigvals(elements)
+    np.testing.assert_allclose(feature.hessian_matrix_eigvals(elements), wanted, atol=1e-12)
+    np.testing.assert_allclose(
+        feature.structure_tensor_eigenvalues([e[0] for e in elements[:3]]),
+        theirs.structure_tensor_eigenvalues([e[0] for e in elements[:3]]),
+        atol=1e-12,
+    )
+    with pytest.raises(backend.ArrayError, match="4 arrays were given"):
+        feature.hessian_matrix_eigvals(elements[:4])
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: backend.eigh(np.zeros((2, 3))), ValueError, "shape"),
+        (lambda: backend.eigh(np.zeros((33, 33))), backend.ArrayError, "1 to 32"),
+        (lambda: backend.eigh(np.eye(3), k=4), ConfigError, "k is 4"),
+        (lambda: backend.eigh(np.eye(3), method="qr"), ConfigError, "method is 'qr'"),
+        (lambda: backend.null_space(np.eye(3), 0), ConfigError, "k is 0"),
+        (lambda: backend.eigh(np.eye(3, dtype=complex)), TypeError, "complex128"),
+        (lambda: backend.eig_special_3d(np.zeros((5, 2))), backend.ArrayError, r"\[6, ...\]"),
+        (lambda: backend.eigenvalues_3d(np.zeros((6, 2)), "up"), ConfigError, "desc and asc"),
+    ],
+)
+def test_errors_say_what_is_allowed(call: Any, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        call()

@@ -11,13 +11,24 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from leafflow_ti.backend.boundary import ArrayError, ArrayTypeError
+    from leafflow_ti.backend.eigen import (
+        eig_special_2d,
+        eig_special_3d,
+        eigenvalues_2d,
+        eigenvalues_3d,
+        eigh,
+        null_space,
+    )
     from leafflow_ti.backend.flow import epi_disparity, optical_flow
 
 _HOME = {
     "ArrayError": "boundary", "ArrayTypeError": "boundary",
+    "eigh": "eigen", "null_space": "eigen", "eig_special_2d": "eigen", "eig_special_3d": "eigen",
+    "eigenvalues_2d": "eigen", "eigenvalues_3d": "eigen",
     "optical_flow": "flow", "epi_disparity": "flow",
 }  # fmt: skip
-__all__ = ["ArrayError", "ArrayTypeError", "epi_disparity", "optical_flow"]
+__all__ = ["ArrayError", "ArrayTypeError", "eig_special_2d", "eig_special_3d", "eigenvalues_2d", "eigenvalues_3d"]
+__all__ += ["eigh", "epi_disparity", "null_space", "optical_flow"]
 
 
 def __getattr__(name: str) -> Any:

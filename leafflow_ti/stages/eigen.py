@@ -11,8 +11,6 @@ from leafflow_ti.runtime import Device
 
 PORTION_BYTES = 1 << 24
 """Of packed matrices: what is worked on at once, so that memory stays bounded."""
-LARGEST = 32
-METHODS = ("ql", "jacobi")
 
 
 def eigenproblems(
