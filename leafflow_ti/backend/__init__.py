@@ -20,15 +20,17 @@ if TYPE_CHECKING:
         null_space,
     )
     from leafflow_ti.backend.flow import epi_disparity, optical_flow
+    from leafflow_ti.backend.warming import warm_up
 
 _HOME = {
     "ArrayError": "boundary", "ArrayTypeError": "boundary",
     "eigh": "eigen", "null_space": "eigen", "eig_special_2d": "eigen", "eig_special_3d": "eigen",
     "eigenvalues_2d": "eigen", "eigenvalues_3d": "eigen",
     "optical_flow": "flow", "epi_disparity": "flow",
+    "warm_up": "warming",
 }  # fmt: skip
 __all__ = ["ArrayError", "ArrayTypeError", "eig_special_2d", "eig_special_3d", "eigenvalues_2d", "eigenvalues_3d"]
-__all__ += ["eigh", "epi_disparity", "null_space", "optical_flow"]
+__all__ += ["eigh", "epi_disparity", "null_space", "optical_flow", "warm_up"]
 
 
 def __getattr__(name: str) -> Any:
