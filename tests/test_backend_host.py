@@ -25,7 +25,8 @@ def told(mode: str, **environment: str) -> dict[str, Any]:
     """What the program says; it must say nothing else, and make no warning, but for Taichi's that a host imports."""
     path = os.pathsep.join(p for p in sys.path if p)
     done = subprocess.run(
-        [sys.executable, *(("-W", "error") if mode != "host" else ()), GUEST, mode], capture_output=True, text=True, check=False, timeout=300,
+        [sys.executable, *(("-W", "error") if mode != "host" else ()), GUEST, mode],
+        capture_output=True, text=True, check=False, timeout=300,
         env={**os.environ, "PYTHONPATH": path, **environment},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
