@@ -16,14 +16,15 @@ import numpy as np
 from leafflow_ti import backend
 
 N_THREADS = 4
-NAMES = ("structure_tensor_2d", "eig_special_2d")
+NAMES = ("epi_disparity", "eig_special_2d")
 
 
 def checksum() -> str:
-    """Of the orientations in one picture."""
-    image = np.random.default_rng(1).standard_normal((40, 50)).astype(np.float32)
-    values, vectors = backend.eig_special_2d(backend.structure_tensor_2d(image, 1.0, 2.0))
-    return hashlib.sha256(values.tobytes() + vectors.tobytes()).hexdigest()
+    """Of eigenvectors and of disparities of some noise."""
+    random = np.random.default_rng(1)
+    values, vectors = backend.eig_special_2d(random.standard_normal((3, 40, 50)).astype(np.float32))
+    disparity = backend.epi_disparity(random.standard_normal((5, 32, 33)).astype(np.float32))
+    return hashlib.sha256(values.tobytes() + vectors.tobytes() + disparity.tobytes()).hexdigest()
 
 
 def in_threads() -> list[str]:

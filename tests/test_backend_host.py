@@ -18,7 +18,7 @@ from leafflow_ti.backend.warming import CALLS
 from leafflow_ti.errors import ConfigError
 
 GUEST = Path(__file__).with_name("backend_guest.py")
-NAMES = ["eig_special_2d", "structure_tensor_2d"]
+NAMES = ["eig_special_2d", "epi_disparity"]
 
 
 def told(mode: str, **environment: str) -> dict[str, Any]:
@@ -64,7 +64,7 @@ import numpy as np
 from leafflow_ti import backend
 from leafflow_ti.errors import DeviceError
 try:
-    backend.structure_tensor_2d(np.zeros((8, 9), np.float32), 1.0, 1.0)
+    backend.eig_special_2d(np.zeros((3, 8, 9), np.float32))
 except DeviceError as error:
     print(error)
 """
@@ -86,11 +86,11 @@ def test_every_function_can_be_warmed_up() -> None:
 
 
 def test_warming_up_says_what_it_took() -> None:
-    found = backend.warm_up("structure_tensor_2d", dtype=("float32", np.float32))
-    assert list(found) == ["structure_tensor_2d"]
-    assert found["structure_tensor_2d"] > 0.0
-    with pytest.raises(ConfigError, match=r"'structure_tensor_4d'.*structure_tensor_3d"):
-        backend.warm_up("structure_tensor_4d")
+    found = backend.warm_up("eig_special_2d", dtype=("float32", np.float32))
+    assert list(found) == ["eig_special_2d"]
+    assert found["eig_special_2d"] > 0.0
+    with pytest.raises(ConfigError, match=r"'eig_special_4d'.*eig_special_3d"):
+        backend.warm_up("eig_special_4d")
 
 
 def test_entry_points_lead_to_the_shims() -> None:
@@ -101,7 +101,6 @@ def test_entry_points_lead_to_the_shims() -> None:
     group = tomllib.loads(text)["project"]["entry-points"]["leafflow.backends"]
     loaded = {name: EntryPoint(name, value, "leafflow.backends").load() for name, value in group.items()}
     assert loaded["arrays"] is backend
-    assert hasattr(loaded["structure_tensor"], "structure_tensor_3d")
     assert hasattr(loaded["skimage.feature"], "structure_tensor_eigenvalues")
     assert hasattr(loaded["skimage.registration"], "optical_flow_ilk")
-    assert set(loaded) == {"arrays", "cv2", "skimage.feature", "skimage.registration", "structure_tensor"}
+    assert set(loaded) == {"arrays", "cv2", "skimage.feature", "skimage.registration"}

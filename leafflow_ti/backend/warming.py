@@ -20,20 +20,12 @@ Make = Callable[..., NDArray[Any]]
 """``make(4, 5)``: numbers of that shape, of the kind that is warmed up."""
 
 CALLS: dict[str, Callable[[Any, Make], object]] = {
-    "derivatives": lambda backend, make: backend.derivatives(make(9, 10)),
-    "gaussian": lambda backend, make: backend.gaussian(make(9, 10), 1.0),
-    "structure_tensor_2d": lambda backend, make: backend.structure_tensor_2d(make(9, 10), 1.0, 1.0),
-    "structure_tensor_3d": lambda backend, make: backend.structure_tensor_3d(make(8, 9, 10), 1.0, 1.0),
-    "hessian_2d": lambda backend, make: backend.hessian_2d(make(9, 10), 1.0),
-    "hessian_3d": lambda backend, make: backend.hessian_3d(make(8, 9, 10), 1.0),
     "eigh": lambda backend, make: backend.eigh(_symmetric(make(4, 3, 3))),
     "null_space": lambda backend, make: backend.null_space(_symmetric(make(4, 3, 3)), 1),
     "eig_special_2d": lambda backend, make: backend.eig_special_2d(make(3, 4, 5)),
     "eig_special_3d": lambda backend, make: backend.eig_special_3d(make(6, 3, 4, 5)),
     "eigenvalues_2d": lambda backend, make: backend.eigenvalues_2d(make(3, 4, 5)),
     "eigenvalues_3d": lambda backend, make: backend.eigenvalues_3d(make(6, 3, 4, 5)),
-    "highpass": lambda backend, make: backend.highpass(make(2, 9, 10), 1.0),
-    "homomorphic": lambda backend, make: backend.homomorphic(1.0 + make(2, 9, 10) ** 2, 1.0),
     "optical_flow": lambda backend, make: backend.optical_flow(make(3, 32, 33)),
     "epi_disparity": lambda backend, make: backend.epi_disparity(make(5, 32, 33)),
 }
@@ -43,7 +35,7 @@ CALLS: dict[str, Callable[[Any, Make], object]] = {
 def warm_up(*names: str, dtype: DTypeLike | Iterable[DTypeLike] = "float32") -> dict[str, float]:
     """Compile what the named functions of ``leafflow_ti.backend`` need, and say how many seconds each took.
 
-    ``names``: such as "structure_tensor_2d"; none: all of them. ``dtype``: one kind of numbers, or several, in which
+    ``names``: such as "optical_flow"; none: all of them. ``dtype``: one kind of numbers, or several, in which
     the program is going to call them. The engine is started, if it does not run. Afterwards threads may call these
     functions at the same time without waiting for a compiler; what is asked for in another structure, such as matrices
     of another size, is still compiled when it is called.
