@@ -129,7 +129,7 @@ def test_twins_of_the_three_stages_find_our_tensors_and_parameters(name: str, st
     for entry, (i, j) in zip(layout.lower, lower, strict=True):
         diagonal = [exact[layout.lower[lower.index((k, k))]] for k in (i, j)]
         # Some 1e3 float32 roundings of 6e-8 each add up like a random walk.
-        assert (np.abs(tensor[entry] - exact[entry]) / np.sqrt(diagonal[0] * diagonal[1])).max() < 5e-6
+        assert (np.abs(np.asarray(tensor[entry]) - exact[entry]) / np.sqrt(diagonal[0] * diagonal[1])).max() < 5e-6
 
 
 def test_twins_refuse_models_that_they_do_not_cover() -> None:

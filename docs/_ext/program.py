@@ -15,6 +15,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 import leafflow_ti
+from leafflow_ti import backend
 from leafflow_ti.cli.main import COMMANDS, invoke
 
 
@@ -63,8 +64,20 @@ class PublicNames(SphinxDirective):
         return self.parse_text_to_nodes("```{eval-rst}\n" + "\n".join(map(entry.format, names)) + "```\n")
 
 
+class BackendNames(SphinxDirective):
+    """``{backend-names}``: the documentation of all functions of ``leafflow_ti.backend``."""
+
+    def run(self) -> list[nodes.Node]:
+        """The documentation of the names in alphabetical order."""
+        self.env.note_reread()
+        found = [name for name in sorted(backend.__all__) if not inspect.isclass(getattr(backend, name))]
+        entries = (f".. autofunction:: leafflow_ti.backend.{name}\n" for name in found)
+        return self.parse_text_to_nodes("```{eval-rst}\n" + "\n".join(entries) + "```\n")
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("commands", Commands)
     app.add_directive("public-names", PublicNames)
+    app.add_directive("backend-names", BackendNames)
     return {"parallel_read_safe": True}
