@@ -101,6 +101,7 @@ def test_entry_points_lead_to_the_shims() -> None:
     group = tomllib.loads(text)["project"]["entry-points"]["leafflow.backends"]
     loaded = {name: EntryPoint(name, value, "leafflow.backends").load() for name, value in group.items()}
     assert loaded["arrays"] is backend
+    assert hasattr(loaded["structure_tensor"], "structure_tensor_3d")
     assert hasattr(loaded["skimage.feature"], "structure_tensor_eigenvalues")
     assert hasattr(loaded["skimage.registration"], "optical_flow_ilk")
-    assert set(loaded) == {"arrays", "cv2", "skimage.feature", "skimage.registration"}
+    assert set(loaded) == {"arrays", "cv2", "skimage.feature", "skimage.registration", "structure_tensor"}

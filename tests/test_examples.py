@@ -50,12 +50,12 @@ def test_a_program_runs(program: Path, tmp_path: Path) -> None:
     assert done.stdout.strip()
 
 
-def consumed(image: np.ndarray, folder: Path, *visible: Path) -> tuple[np.ndarray, str]:
-    """What the example package computes where leafflow-ti is hidden, and these folders are visible; and by what."""
+def consumed(image: np.ndarray, folder: Path, *visible: Path, hidden: bool = True) -> tuple[np.ndarray, str]:
+    """What the example package computes where leafflow-ti is ``hidden`` and these folders are visible; and by what."""
     np.save(folder / "image.npy", image)
     code = f"import sys\nsys.path += {[str(CONSUMER), *map(str, visible)]!r}\n{SCRIPT}"
     done = subprocess.run(
-        [sys.executable, "-c", HIDING + code, folder / "image.npy", folder / "angle.npy"],
+        [sys.executable, "-c", (HIDING if hidden else "") + code, folder / "image.npy", folder / "angle.npy"],
         capture_output=True, text=True, check=False, timeout=120, env={**os.environ, "PYTHONPATH": ""}, cwd=folder,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -105,3 +105,20 @@ def test_the_consumer_with_a_registered_backend(image: np.ndarray, tmp_path: Pat
     assert by == "fast ['fast']"
     own, _ = consumed(image, tmp_path)
     assert np.abs(np.sin(fast - own)).max() < 1e-9
+
+
+def test_the_consumer_with_leafflow_ti(image: np.ndarray, tmp_path: Path) -> None:
+    """As it would be installed: by the entry points that ``pyproject.toml`` states."""
+    import tomllib
+
+    root = EXAMPLES.parent
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    info = tmp_path / "packages" / "ours-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ours\nVersion: 1.0\n")
+    lines = [f"{name} = {value}" for name, value in project["entry-points"]["leafflow.backends"].items()]
+    (info / "entry_points.txt").write_text("\n".join(["[leafflow.backends]", *lines, ""]))
+    fast, by = consumed(image, tmp_path, info.parent, root, hidden=False)
+    assert by == "leafflow_ti.backend.compat.structure_tensor ['leafflow_ti']"
+    own, _ = consumed(image, tmp_path)
+    assert np.abs(np.sin(fast - own)).max() < 1e-6

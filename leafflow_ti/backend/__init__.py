@@ -19,18 +19,25 @@ if TYPE_CHECKING:
         eigh,
         null_space,
     )
+    from leafflow_ti.backend.filters import derivatives, gaussian, gaussian_moments
     from leafflow_ti.backend.flow import epi_disparity, optical_flow
+    from leafflow_ti.backend.tensors import structure_tensor, structure_tensor_2d, structure_tensor_3d
     from leafflow_ti.backend.warming import warm_up
 
 _HOME = {
     "ArrayError": "boundary", "ArrayTypeError": "boundary",
     "eigh": "eigen", "null_space": "eigen", "eig_special_2d": "eigen", "eig_special_3d": "eigen",
     "eigenvalues_2d": "eigen", "eigenvalues_3d": "eigen",
+    "derivatives": "filters", "gaussian": "filters", "gaussian_moments": "filters",
     "optical_flow": "flow", "epi_disparity": "flow",
+    "structure_tensor": "tensors", "structure_tensor_2d": "tensors", "structure_tensor_3d": "tensors",
     "warm_up": "warming",
 }  # fmt: skip
-__all__ = ["ArrayError", "ArrayTypeError", "eig_special_2d", "eig_special_3d", "eigenvalues_2d", "eigenvalues_3d"]
-__all__ += ["eigh", "epi_disparity", "null_space", "optical_flow", "warm_up"]
+__all__ = [
+    "ArrayError", "ArrayTypeError", "derivatives", "eig_special_2d", "eig_special_3d", "eigenvalues_2d",
+    "eigenvalues_3d", "eigh", "epi_disparity", "gaussian", "gaussian_moments", "null_space", "optical_flow",
+    "structure_tensor", "structure_tensor_2d", "structure_tensor_3d", "warm_up",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -20,6 +20,12 @@ Make = Callable[..., NDArray[Any]]
 """``make(4, 5)``: numbers of that shape, of the kind that is warmed up."""
 
 CALLS: dict[str, Callable[[Any, Make], object]] = {
+    "derivatives": lambda backend, make: backend.derivatives(make(9, 10)),
+    "gaussian": lambda backend, make: backend.gaussian(make(9, 10), 1.0),
+    "gaussian_moments": lambda backend, make: backend.gaussian_moments(make(9, 10), 1.0, [(0, 0)]),
+    "structure_tensor": lambda backend, make: backend.structure_tensor(make(2, 9, 10), 1.0),
+    "structure_tensor_2d": lambda backend, make: backend.structure_tensor_2d(make(9, 10), 1.0, 1.0),
+    "structure_tensor_3d": lambda backend, make: backend.structure_tensor_3d(make(8, 9, 10), 1.0, 1.0),
     "eigh": lambda backend, make: backend.eigh(_symmetric(make(4, 3, 3))),
     "null_space": lambda backend, make: backend.null_space(_symmetric(make(4, 3, 3)), 1),
     "eig_special_2d": lambda backend, make: backend.eig_special_2d(make(3, 4, 5)),
