@@ -175,3 +175,40 @@ def test_eigenvalues_as_scikit_image_has_them() -> None:
 def test_errors_say_what_is_allowed(call: Any, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         call()
+
+
+def assert_planes_are_solved(n: int, count: int, dtype: type) -> None:
+    """Random, indefinite, repeated, singular, zero and diagonal tensors, large and small, as planes."""
+    random = np.random.default_rng(5)
+    some = random.standard_normal((count, n, n))
+    some = some + some.swapaxes(1, 2)
+    special = [np.eye(n), np.zeros((n, n)), np.ones((n, n)), np.diag(np.arange(n) - 1.0), np.eye(n) + 1e-7 * some[0]]
+    some[: len(special)] = special[:count]
+    some *= 10.0 ** random.integers(-12, 12, count)[:, None, None]
+    some = some.astype(dtype)
+    pairs = [(i, i) for i in range(n)] + list(itertools.combinations(range(n), 2))
+    planes = np.stack([some[:, i, j] for i, j in pairs])
+    values, vectors = (backend.eig_special_2d if n == 2 else backend.eig_special_3d)(planes, full=True)
+    values, vectors = values.T, vectors.transpose(2, 1, 0)
+    if n == 3:  # descending
+        values, vectors = values[:, ::-1], vectors[:, :, ::-1]
+    assert_solved(some, values, vectors, BOUND[dtype])
+    one = (backend.eig_special_2d if n == 2 else backend.eig_special_3d)(planes)[1]
+    np.testing.assert_array_equal(one.T, vectors[:, :, 0])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("count", [3, 16, 70])
+def test_planes_of_tensors(count: int, n: int, dtype: type) -> None:
+    assert_planes_are_solved(n, count, dtype)
+
+
+def test_a_tensor_that_is_not_finite_spoils_no_other() -> None:
+    planes = np.random.default_rng(6).standard_normal((6, 40))
+    wanted = backend.eig_special_3d(planes)
+    planes[3, 7], planes[0, 20] = np.nan, np.inf
+    found = backend.eig_special_3d(planes)
+    for one, other in zip(found, wanted, strict=True):
+        assert np.isnan(one[:, [7, 20]]).all()
+        np.testing.assert_array_equal(np.delete(one, [7, 20], axis=1), np.delete(other, [7, 20], axis=1))

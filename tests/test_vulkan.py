@@ -25,6 +25,7 @@ import test_refine
 from reference import chain, patch
 from refine_bench import SCENE, Case, covariance, estimated
 from test_backend_flow import assert_follow_equals_twin
+from test_backend_tensors import assert_gaussian_equals_scipy
 from test_kernels_estimate import assert_maps_equal
 from test_prefilter import assert_equals_twin
 from test_search import assert_search_equals_twin
@@ -67,7 +68,7 @@ def test_suite_on_vulkan() -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {"LEAFFLOW_TI_ARCH": "vulkan"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 12} passed" in done.stdout
+    assert f"{len(SYSTEMS) + len(WEIGHTED) + len(PREFILTERS) + 15} passed" in done.stdout
 
 
 def on_vulkan_the_engine_really_runs_on_it(device: Callable) -> None:
@@ -82,6 +83,15 @@ def on_vulkan_eigenproblems_are_solved(device: Callable) -> None:
     some = test_backend_eigen.matrices(6).astype(np.float32)
     values, vectors = test_backend_eigen.solved(device("f32"), some, 6)
     test_backend_eigen.assert_solved(some, values, vectors, test_backend_eigen.BOUND[np.float32])
+
+
+def on_vulkan_planes_of_tensors_are_solved() -> None:
+    for n, count in ((2, 3), (3, 70)):
+        test_backend_eigen.assert_planes_are_solved(n, count, np.float32)
+
+
+def on_vulkan_a_gaussian_is_that_of_scipy() -> None:
+    assert_gaussian_equals_scipy((6, 7, 80), np.float32, "constant")
 
 
 def on_vulkan_filtering_is_correlation(device: Callable) -> None:

@@ -1,7 +1,8 @@
 """Eigenvalues and eigenvectors of batches of symmetric matrices, and of fields of structure tensors.
 
-All by Householder reflections and implicit QL (Wilkinson and Reinsch 1971), one matrix per lane, in double precision
-where the device has it. A matrix with an entry that is not finite gets NaN, and no other matrix does.
+Batches of matrices by Householder reflections and implicit QL (Wilkinson and Reinsch 1971), one matrix per lane, in
+double precision where the device has it; fields of 2 x 2 and 3 x 3 tensors by Jacobi's rotations in the precision of
+the input. A matrix with an entry that is not finite gets NaN, and no other matrix does.
 """
 
 from __future__ import annotations
@@ -16,10 +17,6 @@ from leafflow_ti.errors import ConfigError
 LARGEST = 32
 """Rows of a matrix at most: the work space of more would not fit the caches."""
 METHODS = {"auto": "ql", "ql": "ql", "jacobi": "jacobi"}
-LOWER_2D = (0, 2, 1)
-"""Of ``(xx, yy, xy)``: the lower triangle by rows."""
-LOWER_3D = (0, 3, 1, 4, 5, 2)
-"""Of ``(xx, yy, zz, xy, xz, yz)``."""
 
 
 class NullSpace(NamedTuple):
@@ -58,15 +55,12 @@ def null_space(matrices: Any, k: int, method: str = "auto") -> NullSpace:
 
 def eigenvalues_2d(S: Any) -> Any:
     """Eigenvalues [2, ...], ascending, of structure tensors ``(xx, yy, xy)`` [3, ...]."""
-    call = opened(S)
-    return call.give(_of_fields(call, S, 2, False)[0])
+    return _of_fields(S, 2, 0, False)[0]
 
 
 def eigenvalues_3d(S: Any, eigenvalue_order: Literal["desc", "asc"] = "desc") -> Any:
     """Eigenvalues [3, ...] of structure tensors ``(xx, yy, zz, xy, xz, yz)`` [6, ...]."""
-    call = opened(S)
-    values = _of_fields(call, S, 3, False)[0]
-    return call.give(values[:: _step(eigenvalue_order)])
+    return _of_fields(S, 3, 0, _descending(eigenvalue_order))[0]
 
 
 def eig_special_2d(S: Any, full: bool = False) -> tuple[Any, Any]:
@@ -76,11 +70,7 @@ def eig_special_2d(S: Any, full: bool = False) -> tuple[Any, Any]:
     The second component is positive, or the first where the second is 0.
     Raises ArrayError for another shape.
     """
-    call = opened(S)
-    values, vectors = _of_fields(call, S, 2, True, 2 if full else 1)
-    negative = (vectors[1] < 0) | ((vectors[1] == 0) & (vectors[0] < 0))
-    turned = np.swapaxes(np.where(negative, -vectors, vectors), 0, 1)
-    return call.give(values), call.give(turned if full else turned[0])
+    return _of_fields(S, 2, 2 if full else 1, False)
 
 
 def eig_special_3d(S: Any, full: bool = False, eigenvalue_order: Literal["desc", "asc"] = "desc") -> tuple[Any, Any]:
@@ -90,19 +80,13 @@ def eig_special_3d(S: Any, full: bool = False, eigenvalue_order: Literal["desc",
     The product of a vector's components is not negative; where it is 0, the sum of the components is not.
     Raises ArrayError for another shape, ConfigError for another order.
     """
-    call = opened(S)
-    step = _step(eigenvalue_order)
-    values, vectors = _of_fields(call, S, 3, True, 3 if full else 1)
-    product = vectors.prod(axis=0)
-    negative = (product < 0) | ((product == 0) & (vectors.sum(axis=0) < 0))
-    turned = np.swapaxes(np.where(negative, -vectors, vectors), 0, 1)
-    return call.give(values[::step]), call.give(turned[::step] if full else turned[0])
+    return _of_fields(S, 3, 3 if full else 1, _descending(eigenvalue_order))
 
 
-def _step(order: str) -> int:
+def _descending(order: str) -> bool:
     if order not in ("desc", "asc"):
         raise ConfigError(f"eigenvalue_order is '{order}': allowed are desc and asc")
-    return -1 if order == "desc" else 1
+    return order == "desc"
 
 
 def _check_number(k: int, n: int) -> None:
@@ -130,17 +114,18 @@ def _solved(call: Call, read: Any, k: int | None, vectors: bool, method: str) ->
     return values.reshape(*batch, k), None if found is None else found.reshape(*batch, n, k)
 
 
-def _of_fields(call: Call, S: Any, n: int, wanted: bool, k: int = 1) -> tuple[Any, Any]:
-    """Values [n, ...], ascending, and vectors [component, k, ...] of packed fields."""
-    from leafflow_ti.stages.eigen import eigenproblems
+def _of_fields(S: Any, n: int, wanted: int, descending: bool) -> tuple[Any, Any]:
+    """Values [n, ...] and vectors of packed fields, by Jacobi's rotations."""
+    from leafflow_ti.stages.eigen import eigen_of_planes
 
+    call = opened(S)
     read = call.read(S)
     size = n * (n + 1) // 2
     if read.ndim < 1 or read.shape[0] != size:
         raise ArrayError(f"S has the shape {read.shape}: it must be [{size}, ...]")
-    lower = read.reshape(size, -1)[list(LOWER_2D if n == 2 else LOWER_3D)]
-    values = np.empty((n, lower.shape[1]), call.dtype)
-    vectors = np.empty((n, n, lower.shape[1]), call.dtype) if wanted else None
-    eigenproblems(lower, n, call.device, values, vectors)
+    values, vectors = eigen_of_planes(read.reshape(size, -1), n, call.device, wanted, descending)
     shape = read.shape[1:]
-    return values.reshape(n, *shape), None if vectors is None else vectors[:, :k].reshape(n, k, *shape)
+    if vectors is None:
+        return call.give(values.reshape(n, *shape)), None
+    rows = (n,) if wanted == 1 else (n, n)
+    return call.give(values.reshape(n, *shape)), call.give(vectors.reshape(*rows, *shape))

@@ -89,3 +89,41 @@ def _spread(source: Any, target: NDArray[Any], device: Device, lanes: int, group
     target[..., : whole * lanes].reshape(*rows, whole, lanes)[...] = by_groups[..., :whole, :]
     if whole < groups:
         target[..., whole * lanes :] = by_groups[..., whole, : count - whole * lanes]
+
+
+def eigen_of_planes(
+    planes: NDArray[Any], n: int, device: Device, wanted: int, descending: bool
+) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """Eigenvalues [n, count] of symmetric matrices of ``n`` = 2 or 3 rows, and the ``wanted`` = 0, 1 (the smallest's)
+    or n eigenvectors [wanted, n, count] in their order, from contiguous planes ``(xx, yy, xy)`` or
+    ``(xx, yy, zz, xy, xz, yz)`` of the storage's type. What is not finite has NaN as results."""
+    from leafflow_ti.kernels.eigen_planes import eigen_planes_kernel
+
+    spec, count = device.moments, planes.shape[1]
+    real = device.real("storage")
+    broken = None
+    with np.errstate(over="ignore", invalid="ignore"):
+        if not np.isfinite(planes.sum()):  # of finite numbers, too, but then nothing is lost
+            broken = ~np.isfinite(planes).all(axis=0)
+    wide = max(count, spec.lanes)
+    if broken is not None or wide > count:
+        padded = np.zeros((len(planes), wide), real)
+        padded[:, :count] = planes if broken is None else np.where(broken, 0, planes)
+        planes = padded
+    values = np.empty((n, wide), real)
+    vectors = np.empty((wanted, n, wide) if wanted else (1,), real)
+    if device.gpu:
+        found = device.empty(values.size), device.empty(vectors.size)
+        eigen_planes_kernel(spec, n, wanted)(wide, int(descending), 1, device.array(planes), *found)
+        values, vectors = (device.host(f).reshape(t.shape) for f, t in zip(found, (values, vectors), strict=True))
+    else:
+        tasks = device.tasks(-(-wide // spec.lanes))
+        eigen_planes_kernel(spec, n, wanted)(
+            wide, int(descending), tasks, *(array.reshape(-1) for array in (planes, values, vectors))
+        )
+    values, turned = values[:, :count], vectors[..., :count] if wanted else None
+    if broken is not None:
+        values[:, broken] = np.nan
+        if turned is not None:
+            turned[..., broken] = np.nan
+    return values, turned
