@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -174,6 +175,11 @@ def test_functions_of_scikit_image_on_volumes() -> None:
             ConfigError, "derivatives is '4'",
         ),
         (lambda: backend.structure_tensor(np.zeros(3), 1.0), backend.ArrayError, r"\[n, \.\.\.\]"),
+        (
+            lambda: ours.parallel_structure_tensor_analysis(np.zeros((3, 3, 3)), 1, 1, devices=["cuda:0"]),
+            ConfigError, "cuda:0.*LEAFFLOW_TI_ARCH",
+        ),
+        (lambda: ours.parallel_structure_tensor_analysis(np.zeros((3,) * 3), 1, 1, None, None), ConfigError, "nothing"),
         (lambda: feature.structure_tensor(np.zeros((3, 3, 3)), order="xy"), ConfigError, "order is 'xy'"),
         (lambda: feature.hessian_matrix(np.zeros((1, 3))), backend.ArrayError, "2 samples or more"),
     ],
@@ -182,3 +188,24 @@ def test_bad_input_is_one_line(call: Any, error: type[Exception], words: str) ->
     with pytest.raises(error, match=words) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_blocks_are_parts_of_the_whole(tmp_path: Path) -> None:
+    volume, done = noise((21, 30, 17), np.float32), []
+    into = np.memmap(tmp_path / "vectors", np.float32, "w+", shape=(3, 3, *volume.shape))
+    tensors, values, vectors = ours.parallel_structure_tensor_analysis(
+        volume, 1.0, 1.5, into, np.float64, np.float32, block_size=11, include_all_eigenvectors=True,
+        eigenvalue_order="asc", progress_callback_fn=lambda n, of: done.append((n, of)),
+    )  # fmt: skip
+    whole = ours.structure_tensor_3d(volume, 1.0, 1.5)
+    assert vectors is into
+    assert values.dtype == np.float64
+    assert done == [(n, 12) for n in range(1, 13)]
+    np.testing.assert_allclose(tensors, whole, atol=2e-6 * whole.max())
+    wanted = ours.eig_special_3d(tensors, full=True, eigenvalue_order="asc")
+    np.testing.assert_allclose(values, wanted[0], atol=2e-6 * whole.max())
+    np.testing.assert_allclose(np.abs((vectors * wanted[1]).sum(axis=1)), 1.0, atol=1e-4)
+    none = ours.parallel_structure_tensor_analysis(volume, 1.0, 1.5, None, np.float32)
+    assert none[0] is None
+    assert none[2] is None
+    np.testing.assert_allclose(none[1], values[::-1], atol=4e-6 * whole.max())

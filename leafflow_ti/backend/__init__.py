@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     )
     from leafflow_ti.backend.filters import derivatives, gaussian, gaussian_moments
     from leafflow_ti.backend.flow import epi_disparity, optical_flow
+    from leafflow_ti.backend.prefilters import highpass, homomorphic
     from leafflow_ti.backend.tensors import structure_tensor, structure_tensor_2d, structure_tensor_3d
     from leafflow_ti.backend.warming import warm_up
 
@@ -30,12 +31,14 @@ _HOME = {
     "eigenvalues_2d": "eigen", "eigenvalues_3d": "eigen",
     "derivatives": "filters", "gaussian": "filters", "gaussian_moments": "filters",
     "optical_flow": "flow", "epi_disparity": "flow",
+    "highpass": "prefilters", "homomorphic": "prefilters",
     "structure_tensor": "tensors", "structure_tensor_2d": "tensors", "structure_tensor_3d": "tensors",
     "warm_up": "warming",
 }  # fmt: skip
 __all__ = [
     "ArrayError", "ArrayTypeError", "derivatives", "eig_special_2d", "eig_special_3d", "eigenvalues_2d",
-    "eigenvalues_3d", "eigh", "epi_disparity", "gaussian", "gaussian_moments", "null_space", "optical_flow",
+    "eigenvalues_3d", "eigh", "epi_disparity", "gaussian", "gaussian_moments", "highpass", "homomorphic",
+    "null_space", "optical_flow",
     "structure_tensor", "structure_tensor_2d", "structure_tensor_3d", "warm_up",
 ]  # fmt: skip
 

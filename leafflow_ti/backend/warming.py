@@ -32,6 +32,8 @@ CALLS: dict[str, Callable[[Any, Make], object]] = {
     "eig_special_3d": lambda backend, make: backend.eig_special_3d(make(6, 3, 4, 5)),
     "eigenvalues_2d": lambda backend, make: backend.eigenvalues_2d(make(3, 4, 5)),
     "eigenvalues_3d": lambda backend, make: backend.eigenvalues_3d(make(6, 3, 4, 5)),
+    "highpass": lambda backend, make: backend.highpass(make(9, 10), 1.0),
+    "homomorphic": lambda backend, make: backend.homomorphic(1.0 + make(9, 10) ** 2, 1.0),
     "optical_flow": lambda backend, make: backend.optical_flow(make(3, 32, 33)),
     "epi_disparity": lambda backend, make: backend.epi_disparity(make(5, 32, 33)),
 }
